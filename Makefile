@@ -52,7 +52,7 @@ help:
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
 	@echo 'make test-bare     make run and make test in bare root folders of Debian 12 and 13 (as root; hours)'
 	@echo 'make test-raspberry-pi'
-	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
+	@echo '                   a smoke test on an emulated Raspberry Pi 3 and 4 (installs a cross compiler)'
 	@echo 'make soak          a day of printing with faults, in virtual time: 10 to 20 minutes (SECONDS=86400 SEED=)'
 	@echo 'make soak-real     an hour of the real program on a busy computer (MINUTES=60 WORKERS=1)'
 	@echo 'make fuzz          random bytes for everything that reads what others wrote: each target for'

@@ -4,11 +4,10 @@
 
 use std::f64::consts::TAU;
 use std::hint::black_box;
-use std::time::{Duration, Instant};
 
 use criterion::Criterion;
-use pinion_camera::Picture;
 use pinion_camera::scene::{Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Printer, Probe, Scene, Servo, Strip};
+use pinion_camera::{Layout, Picture};
 
 /// A printer with everything that the built-in one has, at the end of a print.
 fn scene() -> Scene {
@@ -16,8 +15,8 @@ fn scene() -> Scene {
     Scene {
         nozzle_mm: [122.0, 108.0, 30.0],
         heaters: vec![
-            Heater { name: named("extruder"), celsius: 214.8, on: true },
-            Heater { name: named("heater_bed"), celsius: 60.1, on: false },
+            Heater { name: named("extruder"), celsius: 214.8, target_celsius: Some(215.0), on: true },
+            Heater { name: named("heater_bed"), celsius: 60.1, target_celsius: Some(60.0), on: false },
         ],
         fans: vec![Fan { name: named("fan"), rpm: 4480.0 }],
         lamps: ["light", "beeper", "laser"]
@@ -57,29 +56,27 @@ fn main() {
     let printer = Printer { bed, height_mm: 240.0, gantry: Gantry::Cartesian };
     let Some(mut picture) = Picture::new(printer) else { return };
     let calm = scene();
-    picture.draw(&Scene { laid: wall(20_000), ..scene() });
-    criterion.bench_function("camera/frame", |bencher| {
-        bencher.iter(|| {
-            picture.draw(&calm);
-            black_box(picture.jpeg())
+    let later = Scene { seconds: 100.0, ..scene() };
+    picture.take(&Scene { laid: wall(20_000), ..scene() });
+    // While it is printed, and the whole printer after that.
+    for (name, layout, scene) in
+        [("near", Layout::Wide, &calm), ("near and tall", Layout::Tall, &calm), ("whole", Layout::Wide, &later)]
+    {
+        criterion.bench_function(&format!("camera/frame, {name}"), |bencher| {
+            bencher.iter(|| {
+                picture.draw(scene, layout);
+                black_box(picture.jpeg(layout))
+            });
         });
-    });
-    criterion.bench_function("camera/draw", |bencher| bencher.iter(|| picture.draw(&calm)));
-    // What a piece costs, beside the frame that shows it.
-    let laid = wall(1000);
-    criterion.bench_function("camera/piece of filament", |bencher| {
-        bencher.iter_custom(|count| {
-            let mut time = Duration::ZERO;
-            for _ in 0..count.div_ceil(laid.len() as u64) {
-                let start = Instant::now();
-                picture.draw(&Scene { laid: laid.clone(), ..calm.clone() });
-                let with = start.elapsed();
-                let start = Instant::now();
-                picture.draw(&calm);
-                time += with.saturating_sub(start.elapsed());
-            }
-            time.mul_f64(count as f64 / (count.div_ceil(laid.len() as u64) * laid.len() as u64) as f64)
+        criterion.bench_function(&format!("camera/draw, {name}"), |bencher| {
+            bencher.iter(|| picture.draw(scene, layout));
         });
+    }
+    criterion.bench_function("camera/change of the view", |bencher| {
+        let mut scenes = [&calm, &later].into_iter().cycle();
+        bencher.iter(|| scenes.next().map(|scene| picture.draw(scene, Layout::Wide)));
     });
+    let laid = Scene { laid: wall(1000), ..scene() };
+    criterion.bench_function("camera/1000 pieces of filament", |bencher| bencher.iter(|| picture.take(&laid)));
     criterion.final_summary();
 }

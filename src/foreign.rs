@@ -2,13 +2,15 @@
 //! Data of others: files that may be anything, and names that may contain anything.
 //!
 //! A host, its checkout, other processes and devices choose their own names. Their files are read with [`read`]. Their
-//! names leave the program only after [`plain`], [`plain_json`] or [`plain_xml`].
+//! names leave the program only after [`plain`], [`plain_json`] or [`plain_xml`], and stand in a command as a [`word`].
 
 #![forbid(unsafe_code)]
 
 use std::borrow::Cow;
+use std::fmt::Display;
 use std::fs::{File, Metadata, OpenOptions};
 use std::io::{self, Read};
+use std::ops::RangeInclusive;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -44,22 +46,61 @@ pub(crate) fn read(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A text as part of one line for a terminal or a log. Each control character is replaced.
-///
-/// The C0 and C1 controls and DEL have meanings to terminals. A line feed would begin a line that passes for one of
-/// ours.
+/// The characters that no reader sees and that change what a reader sees: Unicode's bidirectional controls, its line and
+/// paragraph separators, its annotation marks, and all other characters that it calls default ignorable. Two names that
+/// differ only in these look the same.
+const UNSEEN: [RangeInclusive<char>; 18] = [
+    '\u{ad}'..='\u{ad}',
+    '\u{34f}'..='\u{34f}',
+    '\u{61c}'..='\u{61c}',
+    '\u{115f}'..='\u{1160}',
+    '\u{17b4}'..='\u{17b5}',
+    '\u{180b}'..='\u{180f}',
+    '\u{200b}'..='\u{200f}',
+    '\u{2028}'..='\u{202e}',
+    '\u{2060}'..='\u{206f}',
+    '\u{3164}'..='\u{3164}',
+    '\u{fe00}'..='\u{fe0f}',
+    '\u{feff}'..='\u{feff}',
+    '\u{ffa0}'..='\u{ffa0}',
+    '\u{fff0}'..='\u{fffb}',
+    '\u{13430}'..='\u{1343f}',
+    '\u{1bca0}'..='\u{1bca3}',
+    '\u{1d173}'..='\u{1d17a}',
+    '\u{e0000}'..='\u{e0fff}',
+];
+
+/// Whether a character of a name may not be shown. The C0 and C1 controls and DEL have meanings to terminals. A line
+/// feed would begin a line that passes for one of ours. A mark such as U+202E shows the rest of the line backwards.
+pub(crate) fn is_unseen(c: char) -> bool {
+    c.is_control() || UNSEEN.iter().any(|range| range.contains(&c))
+}
+
+/// A text as part of one line for a terminal or a log. Each character that is not seen is replaced.
 pub(crate) fn plain(text: &str) -> Cow<'_, str> {
-    if text.contains(char::is_control) { text.replace(char::is_control, "?").into() } else { text.into() }
+    if text.contains(is_unseen) { text.replace(is_unseen, "?").into() } else { text.into() }
+}
+
+/// A text as one word of a command that a reader gives to a shell. A usual path or name stays as it is.
+pub(crate) fn word(text: impl Display) -> String {
+    let text = text.to_string();
+    let is_usual = |c: char| c.is_ascii_alphanumeric() || "/._-+,:@%=".contains(c);
+    match !text.is_empty() && text.chars().all(is_usual) {
+        true => text,
+        false => format!("'{}'", text.replace('\'', "'\\''")),
+    }
 }
 
 /// The same for JSON, whose lines are separated by line feeds. Inside its strings, line feeds and other characters
-/// below 0x20 are escaped already. The remaining control characters are escaped here.
+/// below 0x20 are escaped already. The remaining ones are escaped here.
 pub(crate) fn plain_json(json: &str) -> String {
     let mut plain = String::with_capacity(json.len());
     for c in json.chars() {
         match c {
             '\n' => plain.push(c),
-            c if c.is_control() => plain += &format!("\\u{:04x}", u32::from(c)),
+            c if is_unseen(c) => {
+                c.encode_utf16(&mut [0; 2]).iter().for_each(|unit| plain += &format!("\\u{unit:04x}"));
+            }
             c => plain.push(c),
         }
     }
@@ -77,7 +118,7 @@ pub(crate) fn plain_xml(text: &str) -> String {
             '"' => plain.push_str("&quot;"),
             // XML has no place for these two.
             '\u{fffe}' | '\u{ffff}' => plain.push(' '),
-            c if c.is_control() => plain.push(' '),
+            c if is_unseen(c) => plain.push(' '),
             c => plain.push(c),
         }
     }
@@ -90,9 +131,9 @@ pub(crate) mod tests {
     use proptest::prelude::*;
     use std::fs;
 
-    /// Any text, often with control characters.
+    /// Any text, often with characters that are not seen.
     pub(crate) fn any_name() -> impl Strategy<Value = String> {
-        "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|\x1b\\[31m|\n<0>){0,12}"
+        "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|[\u{202a}-\u{202e}\u{2028}\u{200b}\u{feff}\u{e0041}]|\x1b\\[31m|\n<0>){0,12}"
     }
 
     #[test]
@@ -116,16 +157,42 @@ pub(crate) mod tests {
         assert!(!read(Path::new("/proc/self/stat"), 4096).unwrap().is_empty());
     }
 
+    #[test]
+    fn a_name_cannot_turn_its_line_around_or_hide_in_it() {
+        // As in "Trojan Source": the words after the mark are shown from right to left.
+        for mark in "\u{202a}\u{202b}\u{202c}\u{202d}\u{202e}\u{2066}\u{2067}\u{2068}\u{2069}\u{200e}\u{200f}\u{61c}\u{2028}\u{2029}\u{200b}\u{200d}\u{2060}\u{feff}\u{ad}\u{3164}\u{fe0f}\u{e0041}".chars() {
+            let name = format!("a{mark}b");
+            assert_eq!(plain(&name), "a?b", "U+{:04X}", u32::from(mark));
+            assert!(plain_json(&format!("\"{name}\"")).is_ascii() && plain_xml(&name) == "a b");
+        }
+        assert_eq!(plain_json("\"\u{e0041}\""), "\"\\udb40\\udc41\"");
+        // Letters of all languages stay, with their accents.
+        for name in ["Grüße", "e\u{301}", "打印机", "מדפסת", "طابعة", "프린터", "µ°½€"] {
+            assert_eq!(plain(name), name);
+        }
+    }
+
+    #[test]
+    fn a_word_of_a_command_is_one_word() {
+        for usual in ["/tmp/klipper_host_mcu", "pinion-mcu@b-2.service", "/dev/serial/by-id/usb-1a86:7523"] {
+            assert_eq!(word(usual), usual);
+        }
+        for name in ["", "a b", "$(reboot)", "a;b", "`id`", "it's", "a\\x2db", "~root", "#", "*", "a\nb", "a&b|c>d"] {
+            let echoed = std::process::Command::new("sh").arg("-c").arg(format!("printf %s {}", word(name))).output();
+            assert_eq!(String::from_utf8(echoed.unwrap().stdout).unwrap(), name);
+        }
+    }
+
     proptest! {
         #[test]
-        fn no_control_character_is_left(text in any_name()) {
+        fn nothing_unseen_is_left(text in any_name()) {
             let shown = plain(&text);
-            prop_assert!(!shown.contains(char::is_control));
+            prop_assert!(!shown.contains(is_unseen));
             prop_assert_eq!(shown.chars().count(), text.chars().count());
             let json = plain_json(&serde_json::json!({ &text: [&text] }).to_string());
-            prop_assert!(!json.contains(char::is_control));
+            prop_assert!(!json.contains(is_unseen));
             let xml = format!("<a>{}</a>", plain_xml(&text));
-            prop_assert!(!xml.contains(char::is_control));
+            prop_assert!(!xml.contains(is_unseen));
             prop_assert_eq!(roxmltree::Document::parse(&xml).unwrap().descendants().count(), 2 + usize::from(!text.is_empty()));
             prop_assert_eq!(&serde_json::from_str::<serde_json::Value>(&json).unwrap()[&text][0], &text);
         }

@@ -7,6 +7,7 @@
 //! - [`runtime`]: threads, pty, real time, signals
 //! - [`klippy`]: facts about a host, found from outside
 //! - `foreign`: data of others: files that may be anything, and names that may contain anything
+//! - `own_folder`: the folders where the program makes and removes files
 //! - `throttled`: a Raspberry Pi's power and temperature
 //! - `status`: the status of a running Pinion, as `pinion status` prints it
 //! - [`trace`]: recordings of the last seconds: events, files, who was late, and exports
@@ -18,6 +19,7 @@
 pub mod cli;
 mod foreign;
 pub mod klippy;
+mod own_folder;
 mod proc;
 pub mod runtime;
 mod status;

@@ -46,7 +46,7 @@ pub(crate) struct Status {
 pub(crate) struct Recorder {
     /// Highest number of bytes of memory that it takes.
     pub(crate) bytes: usize,
-    /// Where the traces are kept, if that is possible there; `None` if none are kept.
+    /// The folder that takes the traces; `None` if none are kept.
     pub(crate) folder: Option<String>,
 }
 

@@ -20,6 +20,11 @@ use pinion_sim::{BedShape, Colour, Look, PartConfig, PathPoint, Recorder, SimCon
 
 use crate::runtime;
 
+use super::own_status::OwnStatus;
+use targets::Targets;
+
+mod targets;
+
 /// Where the camera is served unless told otherwise.
 pub(super) const ADDRESS: &str = "127.0.0.1:8410";
 /// The camera waits for everything else on this computer.
@@ -29,6 +34,8 @@ const READ_PERIOD: Duration = Duration::from_millis(100);
 /// A print begins after a pause of this time, with a piece that is lower than the last one by this much.
 const PAUSE_S: f64 = 20.0;
 const LAYER_MM: f64 = 0.05;
+/// Steps may be uneven for this time.
+const JERK_S: f64 = 0.05;
 /// Points of a path that are kept during a pause: what is drawn needs none.
 const POINTS: usize = 10_000;
 /// The color of a light that has only one.
@@ -65,7 +72,7 @@ impl Camera {
 
     /// Serves the picture from now on, and says where. Call it before this thread runs in real time: the camera's
     /// threads get its scheduling.
-    pub(super) fn start(self, sim: SimProbe) -> Result<(), Trouble> {
+    pub(super) fn start(self, sim: SimProbe, own: OwnStatus) -> Result<(), Trouble> {
         let Camera { listener, gantry, probes } = self;
         let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
         let printer = Printer { bed: shape(bed), height_mm, gantry };
@@ -76,10 +83,16 @@ impl Camera {
             }
             let laid = Arc::new(Mutex::new(Vec::new()));
             let mut filament = Filament::new(sim.clone(), laid.clone());
+            let heaters = sim.heaters().map(|heater| heater.name.to_owned()).collect();
+            let targets = Targets::start(own.clone(), heaters).unwrap_or_else(|error| {
+                log::warn!("the camera shows no targets of heaters: {error}: raise ulimit -u, and start again");
+                Targets::default()
+            });
             let start = Instant::now();
             let look = move || {
                 let laid = std::mem::take(&mut *laid.lock().unwrap_or_else(PoisonError::into_inner));
-                Scene { seconds: start.elapsed().as_secs_f64(), laid, ..scene(&sim, &probes) }
+                let (seconds, is_shut_down) = (start.elapsed().as_secs_f64(), own.stop().is_some());
+                Scene { seconds, is_shut_down, laid, ..scene(&sim, &probes, &targets) }
             };
             let thread = thread::Builder::new().name("camera path".into()).spawn(move || {
                 loop {
@@ -106,13 +119,15 @@ struct Filament {
     read: usize,
     /// The last point where filament was laid.
     last: Option<PathPoint>,
+    /// The speed there.
+    mm_per_s: f64,
     /// What is still to be drawn.
     laid: Arc<Mutex<Vec<Laid>>>,
 }
 
 impl Filament {
     fn new(sim: SimProbe, laid: Arc<Mutex<Vec<Laid>>>) -> Filament {
-        Filament { recorder: sim.recorder(), sim, read: 1, last: None, laid }
+        Filament { recorder: sim.recorder(), sim, read: 1, last: None, mm_per_s: 0.0, laid }
     }
 
     fn read(&mut self) {
@@ -132,8 +147,11 @@ impl Filament {
             if begins {
                 new.clear();
             }
+            let is_joined = self.last.is_some_and(|last| from.at.since(last.at) == 0);
+            self.mm_per_s = speed(&from, &to, is_joined.then_some(self.mm_per_s));
+            let [from_mm, to_mm] = [from, to].map(|point| point.nozzle_mm.map(|mm| mm as f32));
+            new.push(Laid { from_mm, to_mm, mm_per_s: self.mm_per_s as f32, begins });
             self.last = Some(to);
-            new.push(piece(&from, &to, begins));
         }
         self.read = points.len();
         let is_calm = points.last().is_none_or(|last| now.since(last.at) as f64 > PAUSE_S * CLOCK_FREQ as f64);
@@ -148,18 +166,22 @@ impl Filament {
     }
 }
 
-fn piece(from: &PathPoint, to: &PathPoint, begins: bool) -> Laid {
+/// The speed from one point to the next, in mm/s. `before` is the speed up to the first one, if the line was the same.
+/// Short pieces count little: the steps of a busy computer come in jerks, which a part does not show.
+fn speed(from: &PathPoint, to: &PathPoint, before: Option<f64>) -> f64 {
     let mm = |axis: usize| to.nozzle_mm[axis] - from.nozzle_mm[axis];
     let length_mm = (mm(0) * mm(0) + mm(1) * mm(1) + mm(2) * mm(2)).sqrt();
     let seconds = to.at.since(from.at) as f64 / CLOCK_FREQ as f64;
-    let [from_mm, to_mm] = [from, to].map(|point| point.nozzle_mm.map(|mm| mm as f32));
-    Laid { from_mm, to_mm, mm_per_s: (length_mm / seconds) as f32, begins }
+    let now = length_mm / seconds;
+    before.map_or(now, |before| before + (now - before) * (seconds / JERK_S).min(1.0))
 }
 
 /// How a browser gets to the camera.
 fn url(address: SocketAddr) -> String {
     match fs::read_to_string("/proc/sys/kernel/hostname") {
-        Ok(name) if address.ip().is_unspecified() => format!("http://{}:{}", name.trim(), address.port()),
+        Ok(name) if address.ip().to_canonical().is_unspecified() => {
+            format!("http://{}:{}", name.trim(), address.port())
+        }
         _ => format!("http://{address}"),
     }
 }
@@ -213,14 +235,15 @@ fn probe(part: &PartConfig) -> Option<Probe> {
 }
 
 /// The printer now.
-fn scene(sim: &SimProbe, probes: &[Probe]) -> Scene {
+fn scene(sim: &SimProbe, probes: &[Probe], targets: &Targets) -> Scene {
     let mut scene = Scene { nozzle_mm: sim.nozzle_mm(), probes: probes.to_vec(), ..Scene::default() };
     for axis in sim.axes() {
         let (name, position_mm, lost_steps) = (axis.name.into(), axis.position_mm, axis.lost_steps);
         scene.axes.push(Axis { name, position_mm, lost_steps });
     }
     for heater in sim.heaters() {
-        scene.heaters.push(Heater { name: heater.name.into(), celsius: heater.celsius, on: heater.on });
+        let (name, target_celsius) = (heater.name.into(), targets.of(heater.name));
+        scene.heaters.push(Heater { name, celsius: heater.celsius, target_celsius, on: heater.on });
     }
     scene.fans.extend(sim.fans().map(|fan| Fan { name: fan.name.into(), rpm: fan.rpm }));
     for output in sim.outputs() {

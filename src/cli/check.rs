@@ -14,6 +14,7 @@ use std::sync::Arc;
 use nix::unistd::{AccessFlags, access, geteuid};
 
 use crate::FIRMWARE;
+use crate::foreign::word;
 use crate::runtime::realtime::{self, Processors};
 use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid};
 use pinion_firmware::mcu::{Dialect, DialectName};
@@ -129,7 +130,7 @@ fn can_bus(interface: &str, uuid: Option<CanbusUuid>) -> Finding {
         Ok(uuid) => uuid,
         Err(trouble) => return Finding::of("link", Level::Error, trouble),
     };
-    let up = format!("sudo ip link set {interface} up type can bitrate 1000000 restart-ms 100");
+    let up = format!("sudo ip link set {} up type can bitrate 1000000 restart-ms 100", word(interface));
     match can::interface(interface) {
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let remedy = "plug in its adapter, or load its overlay";
@@ -156,7 +157,7 @@ fn link(symlink: &Path) -> Finding {
         _ => Path::new("."),
     };
     let Ok(about_folder) = fs::metadata(folder) else {
-        let remedy = format!("sudo mkdir {}, or choose another path (symlink)", folder.display());
+        let remedy = format!("sudo mkdir {}, or choose another path (symlink)", word(folder.display()));
         return Finding::error("symlink", format!("{path}: there is no folder {}", folder.display()), remedy);
     };
     if access(folder, AccessFlags::W_OK | AccessFlags::X_OK).is_err() {
@@ -173,7 +174,7 @@ fn link(symlink: &Path) -> Finding {
     if let Some(obstacle) = place.obstacle(symlink) {
         let remedy = match place {
             Place::Folder => "choose another path, such as one in that folder (symlink)".to_owned(),
-            _ => format!("sudo rm {path}"),
+            _ => format!("sudo rm {}", word(&path)),
         };
         return Finding::error("symlink", obstacle, remedy);
     }
@@ -183,7 +184,7 @@ fn link(symlink: &Path) -> Finding {
         }
         // In a folder such as /tmp, only the owners of a file and of the folder may replace the file.
         Ok(there) if about_folder.mode() & 0o1000 != 0 && !is_one_of(&[there.uid(), about_folder.uid()]) => {
-            Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {path}"))
+            Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {}", word(&path)))
         }
         Ok(_) => Finding::ok("symlink", format!("{path} is a link, and will be replaced")),
         Err(_) => Finding::ok("symlink", format!("{path} can be made")),

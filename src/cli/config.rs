@@ -4,7 +4,6 @@
 #![forbid(unsafe_code)]
 
 use std::fmt;
-use std::fs;
 use std::io;
 use std::ops::Range;
 use std::path::Path;
@@ -12,15 +11,15 @@ use std::str::FromStr;
 
 use toml::de::{DeTable, DeValue};
 
-use crate::foreign;
 use pinion_firmware::trouble::Trouble;
 
+use super::files;
 use super::settings::{Given, MARGIN_MAX_US, mode};
 
 /// The file that the service reads.
 pub(super) const SYSTEM_FILE: &str = "/etc/pinion/pinion.toml";
-/// Longest configuration that is read because another process names it.
-const FOREIGN_BYTES_MAX: u64 = 1 << 20;
+/// Longest configuration.
+const CONFIG_MIB: u64 = 1;
 
 /// What to do about a line that is no TOML.
 const LINE: &str = "write a key, = and its value, such as realtime = true";
@@ -129,12 +128,12 @@ fn word<T: FromStr<Err = String>>(value: &DeValue<'_>) -> Result<T, Option<Strin
 ///
 /// The file, the line and column, the key, and what to write.
 pub(super) fn load(path: &Path) -> Result<Given, Trouble> {
-    of_file(&path.display(), fs::read(path))
+    load_foreign(path, &path.display().to_string())
 }
 
-/// The same for a file that another process names as `file`. The file may be anything.
+/// The same for a file that another process names as `file`.
 pub(super) fn load_foreign(path: &Path, file: &str) -> Result<Given, Trouble> {
-    of_file(&file, foreign::read(path, FOREIGN_BYTES_MAX))
+    of_file(&file, files::read(path, CONFIG_MIB))
 }
 
 fn of_file(file: &dyn fmt::Display, bytes: io::Result<Vec<u8>>) -> Result<Given, Trouble> {
@@ -210,6 +209,7 @@ pub fn config(bytes: &[u8]) {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use std::fs;
 
     fn error(text: &str) -> String {
         parse(text, &"f.toml").unwrap_err().to_string()

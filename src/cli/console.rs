@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
-use std::io::{self, BufRead, BufReader, IsTerminal};
+use std::io::{self, BufRead, BufReader, IsTerminal, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -32,6 +32,7 @@ use signal_hook::low_level::emulate_default_handler;
 use termina::escape::csi::DecPrivateModeCode;
 
 use crate::klippy::process::{Process, Search, Terminal as Device, find};
+use crate::own_folder::OwnFolder;
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use crate::trace::folder::user_state;
@@ -41,6 +42,7 @@ use pinion_linux::clock::Monotonic;
 use pinion_sim::SimBoard;
 
 use super::complete::{SIMULATED, offering};
+use super::files;
 use super::page::{Page, print};
 use super::settings::{BoardName, sim_config};
 use super::terminal::{Terminal, give_back_at, off};
@@ -52,6 +54,12 @@ const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_millis(20);
 /// How many lines are remembered.
 const HISTORY_LINES: usize = 1000;
+/// Longest file of commands.
+const SCRIPT_MIB: u64 = 64;
+/// Longest line of commands that come from a file or a pipe, in bytes.
+const LINE_MAX: u64 = 1 << 20;
+/// The file of the remembered lines.
+const HISTORY: &str = "console_history";
 const PROMPT: &str = "> ";
 
 /// Options of `pinion console`.
@@ -218,7 +226,7 @@ fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
     match &args.file {
         Some(path) => {
             let about = |error| format!("{}: {error}", path.display());
-            let file = fs::File::open(path)
+            let file = files::open(path, SCRIPT_MIB)
                 .map_err(|error| about(format!("{error}: name a file with commands, or leave out -f")))?;
             script(console, BufReader::new(file)).map_err(about)
         }
@@ -228,14 +236,21 @@ fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
 }
 
 /// Carries the lines out, up to the first that fails.
-fn script(mut console: Console, lines: impl BufRead) -> Result<(), String> {
-    for (number, line) in (1..).zip(lines.lines()) {
-        let line = line.map_err(|error| format!("line {number} cannot be read: {error}"))?;
+fn script(mut console: Console, mut lines: impl BufRead) -> Result<(), String> {
+    let mut line = String::new();
+    for number in 1_u64.. {
+        line.clear();
+        match lines.by_ref().take(LINE_MAX).read_line(&mut line) {
+            Ok(0) => break,
+            Ok(_) if line.len() as u64 == LINE_MAX => return Err(format!("line {number}: it is too long: divide it")),
+            Ok(_) => {}
+            Err(error) => return Err(format!("line {number} cannot be read: {error}")),
+        }
         let told = &mut |line: &str| drop(print(&one(line)));
         if !line.trim().is_empty() {
             told(&format!("{PROMPT}{}", line.trim()));
         }
-        match console.line(&line, told) {
+        match console.line(line.trim_end_matches(['\r', '\n']), told) {
             Ok(Next::Line) => {}
             Ok(Next::End) => break,
             Err(error) => return Err(format!("line {number}: {error}")),
@@ -261,10 +276,11 @@ fn converse(console: Console) -> Result<(), String> {
     let config = config.map_err(about)?.auto_add_history(true).build();
     let mut editor: Editor<Words, FileHistory> = Editor::with_config(config).map_err(about)?;
     editor.set_helper(Some(Words(console.vocabulary().clone())));
-    let history = history_file();
-    if let Some(path) = &history {
+    let state = user_state().map(|state| state.join("pinion"));
+    let history = state.map(|path| (OwnFolder::make(&path), path));
+    if let Some((Ok(folder), _)) = &history {
         // There is no history at the first time.
-        let _ = editor.load_history(path);
+        let _ = editor.load_history(&folder.at(HISTORY));
     }
     // Nothing can be drawn if the output goes elsewhere or the terminal is too simple. Then lines come as they are.
     let Ok(printer) = editor.create_external_printer() else { return script(console, io::stdin().lock()) };
@@ -279,9 +295,9 @@ fn converse(console: Console) -> Result<(), String> {
     };
     runtime::started(session).map_err(|trouble| trouble.to_string())?;
     let ended = read_lines(&mut editor, &lines, &answers, &gone);
-    if let Some(path) = history {
-        let kept = path.parent().map_or(Ok(()), fs::create_dir_all).map_err(|error| error.to_string());
-        let kept = kept.and_then(|()| editor.save_history(&path).map_err(|error| error.to_string()));
+    if let Some((folder, path)) = history {
+        let kept = folder.map_err(|error| error.to_string());
+        let kept = kept.and_then(|folder| editor.save_history(&folder.at(HISTORY)).map_err(|error| error.to_string()));
         if let Err(error) = kept {
             log::warn!("the history is not kept in {}: {error}", path.display());
         }
@@ -349,11 +365,6 @@ fn attend(
             Err(RecvTimeoutError::Disconnected) => return,
         }
     }
-}
-
-/// The file of the remembered lines.
-fn history_file() -> Option<PathBuf> {
-    Some(user_state()?.join("pinion/console_history"))
 }
 
 /// Completes the words of the dictionary.

@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -17,6 +17,7 @@ use pinion_linux::gpio::FastGpio;
 
 use super::complete::{BOARDS, DIALECTS, offering};
 use super::failed;
+use super::files::Output;
 use super::page::{Page, print};
 use super::settings::BoardName;
 
@@ -39,10 +40,7 @@ pub(super) struct DictArgs {
 
 /// Prints the dictionary as JSON.
 pub(super) fn run(args: &DictArgs) -> ExitCode {
-    match dictionary(args).and_then(|json| put(args, &json)) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => failed(error),
-    }
+    put(args).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
@@ -52,9 +50,10 @@ fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
     dialect.dictionary().json().map_err(|error| error.to_string())
 }
 
-fn put(args: &DictArgs, json: &[u8]) -> Result<(), String> {
+fn put(args: &DictArgs) -> Result<(), String> {
+    let json = dictionary(args)?;
     match &args.output {
-        Some(path) => fs::write(path, json).map_err(|error| format!("{} cannot be written: {error}", path.display())),
-        None => print(&Page::json(&String::from_utf8_lossy(json))),
+        Some(path) => Output::check(path, &args.board.files())?.write(|out| out.write_all(&json)),
+        None => print(&Page::json(&String::from_utf8_lossy(&json))),
     }
 }

@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::Write as _;
-use std::fs;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -19,6 +19,7 @@ use super::complete::offering;
 use super::computer::Computer;
 use super::computer::running::print_at_risk;
 use super::failed;
+use super::files::Output;
 use super::page::{Page, print};
 
 mod pin;
@@ -50,16 +51,17 @@ pub(super) fn run(args: &LatencyArgs) -> ExitCode {
         let measured = pin::measure(pin, args.fast_gpio);
         return measured.and_then(|text| print(&Page::text(&text))).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
+    let svg = match args.svg.as_deref().map(|path| Output::check(path, &[])).transpose() {
+        Ok(svg) => svg,
+        Err(error) => return failed(error),
+    };
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let (scheduling, halves) = match measure_both(span) {
         Ok(measured) => measured,
         Err(error) => return failed(error),
     };
     let verdict = judge(&halves, scheduling);
-    let drawn = args.svg.as_ref().map_or(Ok(()), |path| {
-        fs::write(path, draw(&halves, verdict.fitness))
-            .map_err(|error| format!("{} cannot be written: {error}", path.display()))
-    });
+    let drawn = svg.map_or(Ok(()), |svg| svg.write(|out| out.write_all(draw(&halves, verdict.fitness).as_bytes())));
     print(&Page::text(&report(&halves, &verdict))).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 

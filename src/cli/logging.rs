@@ -5,6 +5,9 @@
 //! may stop a terminal. So lines go through a bounded queue to a thread that writes them. Before the guardian is forked
 //! there can be no thread, and the guardian has none. There, a line is written at once, and dropped if nobody reads it
 //! for a second.
+//!
+//! A host or a client can cause some lines as often as it likes. So lines of one kind have a limit. Lines above it are
+//! counted, and one line reports them.
 
 #![forbid(unsafe_code)]
 
@@ -25,6 +28,7 @@ use nix::unistd::write;
 
 use crate::foreign::plain;
 use crate::runtime::started;
+use pinion_linux::clock::monotonic;
 
 /// Highest number of lines that may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
@@ -34,6 +38,12 @@ const FAREWELL: Duration = Duration::from_secs(1);
 const WRITE_TIMEOUT_MS: u16 = 1000;
 /// How many bytes a pipe takes without blocking once poll(2) says that it can be written (`PIPE_BUF`).
 const PIECE_BYTES: usize = 4096;
+
+/// Highest number of lines of one kind within [`PERIOD`]. Further ones are left out and counted. Each of a printer's
+/// outputs may have a line at a stop.
+const KIND_LINES_MAX: u32 = 50;
+/// How long the lines of a kind are counted.
+const PERIOD: Duration = Duration::from_secs(60);
 
 static STDERR: Stderr = Stderr { style: OnceLock::new(), queue: Mutex::new(Queue::new()), changed: Condvar::new() };
 
@@ -53,11 +63,74 @@ struct Queue {
     has_writer: bool,
     /// Whether that thread is writing a line, which is no longer in the queue.
     is_writing: bool,
+    /// The kinds of lines so far.
+    kinds: Vec<Kind>,
+}
+
+/// Lines from one place of the program, or about one thing.
+struct Kind {
+    target: String,
+    place: Option<u32>,
+    /// How many lines have come since `since` (CLOCK_MONOTONIC).
+    lines: u32,
+    since: Duration,
+    /// How many of these were left out.
+    left_out: u64,
+    /// The last line that was not left out.
+    level: Level,
+    text: String,
 }
 
 impl Queue {
     const fn new() -> Queue {
-        Queue { lines: VecDeque::new(), lost: 0, has_writer: false, is_writing: false }
+        Queue { lines: VecDeque::new(), lost: 0, has_writer: false, is_writing: false, kinds: Vec::new() }
+    }
+
+    /// Appends a line if there are not too many of its kind already.
+    fn take(&mut self, record: &Record<'_>, style: Style, now: Duration) {
+        self.report(style, now);
+        if record.level() > Level::Info {
+            // Whoever asks for details gets all of them.
+            return self.push(style.line(record.level(), *record.args()));
+        }
+        let (target, place) = (record.target(), record.line());
+        let known = self.kinds.iter().position(|kind| kind.target == target && kind.place == place);
+        let kind = known.unwrap_or(self.kinds.len());
+        if known.is_none() {
+            let (target, text) = (target.to_owned(), String::new());
+            self.kinds.push(Kind { target, place, lines: 0, since: now, left_out: 0, level: Level::Info, text });
+        }
+        let kind = &mut self.kinds[kind];
+        if now >= kind.since + PERIOD {
+            (kind.lines, kind.since) = (0, now);
+        }
+        if kind.lines == KIND_LINES_MAX {
+            kind.left_out += 1;
+            return;
+        }
+        kind.lines += 1;
+        kind.level = record.level();
+        kind.text = record.args().to_string();
+        let line = style.line(kind.level, *record.args());
+        self.push(line);
+    }
+
+    /// Reports the lines that were left out, of each kind whose period is over.
+    fn report(&mut self, style: Style, now: Duration) {
+        for kind in 0..self.kinds.len() {
+            let kind = &mut self.kinds[kind];
+            if kind.left_out > 0 && now >= kind.since + PERIOD {
+                let were = if kind.left_out == 1 { "line like this was" } else { "lines like this were" };
+                let left_out = std::mem::take(&mut kind.left_out);
+                let line = style.line(kind.level, format_args!("{left_out} more {were} left out: {}", kind.text));
+                self.push(line);
+            }
+        }
+    }
+
+    /// When to report lines that were left out (CLOCK_MONOTONIC).
+    fn due(&self) -> Option<Duration> {
+        self.kinds.iter().filter(|kind| kind.left_out > 0).map(|kind| kind.since + PERIOD).min()
     }
 
     /// Appends a line, or counts it as lost if there is no room.
@@ -108,7 +181,7 @@ impl Style {
                 format!("<{priority}>{text}\n")
             }
             Style::Plain => {
-                let now = pinion_linux::clock::monotonic().as_secs_f64();
+                let now = monotonic().as_secs_f64();
                 format!("[{now:12.6}] {level:5} {text}\n")
             }
         }
@@ -132,6 +205,7 @@ impl Stderr {
     fn write_on(&self) {
         let mut queue = self.queue();
         loop {
+            queue.report(self.style(), monotonic());
             match queue.pop(self.style()) {
                 Some(line) => {
                     queue.is_writing = true;
@@ -142,7 +216,9 @@ impl Stderr {
                 }
                 None => {
                     self.changed.notify_all();
-                    queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
+                    let pause = queue.due().map_or(Duration::MAX, |due| due.saturating_sub(monotonic()));
+                    let waited = self.changed.wait_timeout(queue, pause);
+                    queue = waited.unwrap_or_else(PoisonError::into_inner).0;
                 }
             }
         }
@@ -165,14 +241,14 @@ impl Log for Stderr {
         if !self.enabled(record.metadata()) {
             return;
         }
-        let line = self.style().line(record.level(), *record.args());
+        let style = self.style();
         let mut queue = self.queue();
         if queue.has_writer {
-            queue.push(line);
+            queue.take(record, style, monotonic());
             self.changed.notify_all();
         } else {
             drop(queue);
-            put(&line, WRITE_TIMEOUT_MS.into());
+            put(&style.line(record.level(), *record.args()), WRITE_TIMEOUT_MS.into());
         }
     }
 
@@ -219,6 +295,8 @@ pub(super) fn detach() {
 pub(super) fn finish() {
     let mut queue = STDERR.queue();
     if queue.has_writer {
+        queue.report(STDERR.style(), Duration::MAX);
+        STDERR.changed.notify_all();
         let waited = STDERR.changed.wait_timeout_while(queue, FAREWELL, |queue| !queue.is_done());
         queue = waited.unwrap_or_else(PoisonError::into_inner).0;
         queue.has_writer = false;
@@ -249,6 +327,26 @@ mod tests {
         let journal = stderr.metadata().unwrap();
         let journal = format!("{}:{}", journal.dev(), journal.ino());
         assert!(is_same(&journal, stderr.as_fd()) && !is_same(&journal, other.as_fd()) && !is_same("", stderr.as_fd()));
+    }
+
+    #[test]
+    fn a_flood_of_lines_is_counted_and_does_not_hide_other_lines() {
+        let mut queue = Queue::new();
+        let at = |queue: &mut Queue, target: &str, text: &str, now_s: u64| {
+            let args = format_args!("{text}");
+            let record = Record::builder().target(target).line(Some(7)).level(Level::Error).args(args).build();
+            queue.take(&record, Style::Journal, Duration::from_secs(now_s));
+            std::iter::from_fn(|| queue.pop(Style::Journal)).collect::<Vec<_>>()
+        };
+        let max = u64::from(KIND_LINES_MAX);
+        let kept = (0..1000).flat_map(|n| at(&mut queue, "host", &format!("bad {n}"), 5)).collect::<Vec<_>>();
+        assert_eq!(kept, (0..max).map(|n| format!("<3>bad {n}\n")).collect::<Vec<_>>());
+        assert_eq!(at(&mut queue, "core", "stop", 6), ["<3>stop\n"]);
+        assert_eq!(queue.due(), Some(Duration::from_secs(65)));
+        let next = at(&mut queue, "host", "bad again", 65);
+        let report = format!("<3>{} more lines like this were left out: bad {}\n", 1000 - max, max - 1);
+        assert_eq!(next, [report, "<3>bad again\n".to_owned()]);
+        assert_eq!(queue.due(), None);
     }
 
     proptest! {

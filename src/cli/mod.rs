@@ -4,12 +4,15 @@
 #![forbid(unsafe_code)]
 
 use std::ffi::OsString;
+use std::fs::Metadata;
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use log::LevelFilter;
 
+use crate::klippy::process::is_pseudo_terminal;
 use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
 
@@ -25,10 +28,12 @@ mod console;
 pub mod demo;
 mod dict;
 mod doctor;
+mod files;
 mod finding;
 pub mod latency;
 mod link;
 mod logging;
+mod own_status;
 mod page;
 pub mod pins;
 pub mod run;
@@ -153,6 +158,7 @@ fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
         // This comes first: the lines in the log's queue are lost when the process has ended.
         logging::finish();
+        crate::runtime::give_back();
         let panic = panic.to_string().replace('\n', " ");
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
         std::process::abort();
@@ -170,7 +176,10 @@ fn quietly<T>(work: impl FnOnce() -> T) -> T {
 
 /// Why a user may not ask a running Pinion by its link, which leads to this file.
 fn not_permitted(link: &Path, file: &Path) -> String {
+    // Any user can make a link in /tmp to any file, and the groups of other files open more than a terminal.
+    let is_other = |about: Metadata| !about.file_type().is_socket() && !is_pseudo_terminal(&about);
     let remedy = match Opener::of(file).command() {
+        _ if file.metadata().is_ok_and(is_other) => "name the link of a Pinion".to_owned(),
         Some(command) => format!("\"{command}\" and log in anew, or use sudo"),
         None => "use sudo".to_owned(),
     };
@@ -199,6 +208,21 @@ mod tests {
         end_by_panic();
         let _ = std::thread::Builder::new().name("core".into()).spawn(|| panic!("in the core"));
         std::thread::sleep(std::time::Duration::from_secs(20));
+    }
+
+    #[test]
+    fn a_link_to_another_kind_of_file_makes_nobody_a_member_of_its_group() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let (file, socket) = (folder.path().join("shadow"), folder.path().join("socket"));
+        std::fs::write(&file, "").unwrap();
+        let _socket = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+        for path in [&file, &socket] {
+            std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o660)).unwrap();
+        }
+        let told = not_permitted(Path::new("/tmp/klipper_host_mcu"), &file);
+        assert!(told.ends_with("may not be opened by this user: name the link of a Pinion"), "{told}");
+        assert!(not_permitted(&socket, &socket).contains("use sudo"));
     }
 
     #[test]

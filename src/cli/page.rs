@@ -88,14 +88,15 @@ pub(super) fn draw(text: &str) -> io::Result<()> {
 #[cfg(test)]
 pub(in crate::cli) mod tests {
     use super::*;
+    use crate::foreign::is_unseen;
     use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
     /// Asserts that only lines leave a printer, and no more of them than with harmless names.
     #[track_caller]
     pub(in crate::cli) fn assert_plain(text: &str, lines: usize) {
-        let control = text.chars().find(|c| c.is_control() && *c != '\n');
-        assert_eq!(control, None, "{text:?}");
+        let unseen = text.chars().find(|c| is_unseen(*c) && *c != '\n');
+        assert_eq!(unseen, None, "{text:?}");
         assert_eq!(text.matches('\n').count(), lines, "{text:?}");
     }
 

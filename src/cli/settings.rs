@@ -20,12 +20,15 @@ use pinion_linux::{Guard, LinuxBoard};
 use pinion_sim::{SimBoard, SimConfig};
 
 use super::complete::{BOARDS, FAST, SPOKEN, offering};
+use super::files;
 
 /// The device of the watchdog that -w feeds.
 pub(super) const WATCHDOG: &str = "/dev/watchdog";
 /// The remedy if the device is missing.
 pub(super) const WATCHDOG_REMEDY: &str =
     "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
+/// Longest description of a simulated printer.
+const DESCRIPTION_MIB: u64 = 1;
 /// Highest margin that may be asked for.
 pub(super) const MARGIN_MAX_US: u32 = 10_000;
 
@@ -190,6 +193,14 @@ impl FromStr for Spoken {
 }
 
 impl BoardName {
+    /// The files that it is read from.
+    pub(super) fn files(&self) -> Vec<&Path> {
+        match self {
+            BoardName::Sim(Some(file)) => vec![file],
+            BoardName::Linux | BoardName::Sim(None) => Vec::new(),
+        }
+    }
+
     /// Opens the board. Its outputs are given to `guard`. The timing is for its MCU. `fast_gpio` is for the computer's
     /// pins.
     pub(super) fn open(
@@ -211,5 +222,12 @@ impl BoardName {
 
 /// The description of a simulated printer: from a file, or the default one.
 pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, Trouble> {
-    file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
+    let Some(path) = file else { return Ok(SimConfig::default_printer()) };
+    let unreadable = |cause: String| {
+        let trouble = Trouble::new(cause).of(path.display());
+        trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
+    };
+    let bytes = files::read(path, DESCRIPTION_MIB).map_err(|error| unreadable(error.to_string()))?;
+    let text = String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))?;
+    SimConfig::parse(&text, &path.display().to_string())
 }

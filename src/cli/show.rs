@@ -22,10 +22,11 @@ use crate::foreign::plain;
 use pinion_linux::clock::monotonic;
 use pinion_sim::SimProbe;
 
+use super::own_status::OwnStatus;
 use super::page::draw;
 use super::terminal::{
-    ERASE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Terminal, all_scrolls, give_back_at, off, on,
-    rows, scrolling, to_row,
+    DELETE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Size, Terminal, all_scrolls, give_back_at, off,
+    on, scrolling, size, to_row, up,
 };
 use changes::Changes;
 
@@ -93,8 +94,10 @@ struct Number {
 }
 
 /// All visible things now.
-fn look(probe: &SimProbe) -> Vec<Item> {
-    let mut items = Vec::new();
+fn look(probe: &SimProbe, own: &OwnStatus) -> Vec<Item> {
+    let state = own.stop().map_or("runs".into(), |stop| format!("SHUT DOWN: {stop}; the log says more"));
+    // It is the first: a small terminal shows only the first lines.
+    let mut items = vec![Item { kind: Kind::Part, name: "mcu".into(), number: None, text: state }];
     for axis in probe.axes() {
         let lost = if axis.lost_steps > 0 { format!(" ({} steps lost)", axis.lost_steps) } else { String::new() };
         // A value next to zero must not be "-0.00".
@@ -222,16 +225,16 @@ fn picture(items: &[Item], paint: bool) -> Vec<String> {
 /// that.
 #[derive(Default)]
 struct Screen {
-    /// The terminal's rows, and how many of them are the picture's. Both are 0 before the first picture.
-    rows: usize,
-    picture_rows: usize,
+    /// The terminal's size, and how many of its rows are the picture's. `None` before the first picture.
+    placed: Option<(Size, usize)>,
     /// The lines in the picture's rows.
     drawn: Vec<String>,
 }
 
 impl Screen {
-    /// The output that draws these lines on a terminal of `rows` rows. Empty if they are there already.
-    fn draw(&mut self, mut lines: Vec<String>, rows: usize) -> String {
+    /// The output that draws these lines on a terminal of this size. Empty if they are there already.
+    fn draw(&mut self, mut lines: Vec<String>, size: Size) -> String {
+        let rows = size.rows;
         let mut out = String::new();
         let room = rows.saturating_sub(LOG_ROWS).max(1);
         if lines.len() > room {
@@ -240,16 +243,20 @@ impl Screen {
             lines.push(format!("... and {left_out} lines more, on a terminal with more rows"));
         }
         // The picture does not shrink, so that the rows above do not jump.
-        let picture_rows = if rows == self.rows { lines.len().max(self.picture_rows) } else { lines.len() };
-        if (rows, picture_rows) != (self.rows, self.picture_rows) {
-            if self.rows > 0 {
-                let top = self.rows.saturating_sub(self.picture_rows) + 1;
-                out += &format!("{}{}{ERASE_BELOW}", scrolling(usize::MAX), to_row(top));
-            }
-            out += &"\n".repeat(picture_rows);
+        let picture_rows = match self.placed {
+            Some((before, picture_rows)) if before == size => lines.len().max(picture_rows),
+            _ => lines.len(),
+        };
+        if self.placed != Some((size, picture_rows)) {
+            // A terminal that changes its size moves what it shows, and wraps it anew. Only the cursor still tells where
+            // the log ends: the picture is below it, wherever that is. Its rows are deleted, because some terminals keep
+            // erased ones in their history and show them again when they grow.
+            out += &format!("{SAVE_CURSOR}{}{RESTORE_CURSOR}{DELETE_BELOW}", scrolling(usize::MAX));
+            // This makes room, and the log goes on where it was.
+            out += &format!("{}{}", "\n".repeat(picture_rows), up(picture_rows));
             let log_rows = rows.saturating_sub(picture_rows).max(1);
-            out += &format!("{}{}", scrolling(log_rows), to_row(log_rows));
-            (self.rows, self.picture_rows) = (rows, picture_rows);
+            out += &format!("{SAVE_CURSOR}{}{RESTORE_CURSOR}", scrolling(log_rows));
+            self.placed = Some((size, picture_rows));
             self.drawn.clear();
         }
         let top = rows.saturating_sub(picture_rows) + 1;
@@ -278,11 +285,11 @@ pub(super) struct Show {
 impl Show {
     /// Makes a thread that will show the printer on stdout. Make it before the MCU runs. A real-time thread passes its
     /// scheduling on to the threads that it starts. Such a thread would keep a host from the processor.
-    pub(super) fn prepare(probe: SimProbe) -> io::Result<Show> {
+    pub(super) fn prepare(probe: SimProbe, own: OwnStatus) -> io::Result<Show> {
         let (go, went) = mpsc::channel();
         let (finished, done) = mpsc::channel();
         thread::Builder::new().name("show".into()).spawn(move || {
-            let shown = went.recv().map_or(Ok(()), |()| show(&probe, &went));
+            let shown = went.recv().map_or(Ok(()), |()| show(|| look(&probe, &own), &went));
             if let Err(error) = shown {
                 // A reader that went away, such as `head`, is no failure. The printer continues to serve.
                 if error.kind() != io::ErrorKind::BrokenPipe {
@@ -312,13 +319,13 @@ fn is_screen() -> bool {
     io::stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
 }
 
-fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
+fn show(look: impl Fn() -> Vec<Item>, stopped: &Receiver<()>) -> io::Result<()> {
     let is_over = |period| stopped.recv_timeout(period) != Err(RecvTimeoutError::Timeout);
     if !is_screen() {
         let mut changes = Changes::default();
         loop {
             let is_over = is_over(LOOK_PERIOD);
-            let lines = changes.lines(&look(probe), monotonic(), is_over);
+            let lines = changes.lines(&look(), monotonic(), is_over);
             if !lines.is_empty() {
                 draw(&lines)?;
             }
@@ -340,7 +347,7 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
             // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
             kill(getpid(), Signal::SIGTERM)?;
         }
-        let drawing = screen.draw(picture(&look(probe), paint), rows());
+        let drawing = screen.draw(picture(&look(), paint), size());
         if !drawing.is_empty() {
             terminal.change(drawing, all_scrolls())?;
         }
@@ -431,9 +438,10 @@ mod tests {
                     let numbers: Vec<usize> = rest[..end].split(';').filter_map(|n| n.parse().ok()).collect();
                     match (&rest[end..=end], &numbers[..]) {
                         ("H", [row, 1]) => self.row = row.min(&10) - 1,
+                        ("A", [rows]) => self.row -= rows,
                         ("r", [1, bottom]) => (self.bottom, self.row) = (*bottom, 0),
                         ("r", []) => (self.bottom, self.row) = (10, 0),
-                        ("J", [0]) => self.screen[self.row..].fill(String::new()),
+                        ("M", [999]) => self.screen[self.row..].fill(String::new()),
                         ("K" | "l" | "h", _) => {}
                         other => panic!("{other:?}"),
                     }
@@ -470,23 +478,33 @@ mod tests {
 
     #[test]
     fn the_picture_stays_at_the_bottom_and_the_log_scrolls_above_it() {
+        const SIZE: Size = Size { rows: 10, columns: 80 };
         let mut terminal = Terminal { bottom: 10, ..Terminal::default() };
         let mut screen = Screen::default();
         let lines = |lines: &[&str]| lines.iter().map(|line| (*line).to_owned()).collect::<Vec<_>>();
         terminal.take("shell\n");
-        terminal.take(&screen.draw(lines(&["a", "b"]), 10));
+        terminal.take(&screen.draw(lines(&["a", "b"]), SIZE));
         assert_eq!(terminal.rows()[8..], ["a", "b"]);
+        terminal.take("log\n");
+        assert_eq!(terminal.rows()[..3], ["shell", "log", ""], "the log goes on where the shell was");
         for n in 0..20 {
             terminal.take(&format!("log {n}\n"));
         }
         assert_eq!(terminal.rows()[5..], ["log 18", "log 19", "", "a", "b"]);
-        assert_eq!(screen.draw(lines(&["a", "b"]), 10), "", "nothing changed");
-        terminal.take(&screen.draw(lines(&["a", "c", "d"]), 10));
+        assert_eq!(screen.draw(lines(&["a", "b"]), SIZE), "", "nothing changed");
+        terminal.take(&screen.draw(lines(&["a", "c", "d"]), SIZE));
         assert_eq!(terminal.rows()[7..], ["a", "c", "d"]);
         terminal.take("log\n");
         assert_eq!(terminal.rows()[5..], ["log", "", "a", "c", "d"]);
+        // A narrower terminal has moved the picture: a line of it is in two rows. The cursor still is where the log ends.
+        terminal.screen[..].rotate_left(1);
+        terminal.screen[9] = "d, wrapped".into();
+        terminal.row -= 1;
+        terminal.bottom = 10;
+        terminal.take(&screen.draw(lines(&["a", "c", "d"]), Size { columns: 40, ..SIZE }));
+        assert_eq!(terminal.rows()[3..], ["log 19", "log", "", "", "a", "c", "d"]);
         // This is too much for the terminal: three rows are the log's.
-        let many = screen.draw((0..30).map(|n| n.to_string()).collect(), 10);
+        let many = screen.draw((0..30).map(|n| n.to_string()).collect(), SIZE);
         terminal.take(&many);
         assert_eq!(terminal.rows()[8..], ["5", "... and 24 lines more, on a terminal with more rows"]);
         terminal.take(&all_scrolls());

@@ -4,8 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::Display;
-use std::fs;
-use std::io::{self, IsTerminal};
+use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -30,6 +29,8 @@ use pinion_linux::sys;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
 use super::camera::{self, Camera};
+use super::files::Output;
+use super::own_status::OwnStatus;
 use super::page::{Page, print};
 use super::settings::sim_config;
 use super::show::Show;
@@ -64,6 +65,10 @@ pub(super) struct SimArgs {
     /// Draw the homing: position, endstop and step rate over time
     #[arg(long, value_name = "FILE.svg")]
     picture: Option<PathBuf>,
+    /// Write a line for each SPI transfer: the bus, the selected chips, the bytes in both directions. It serves a host,
+    /// without the demonstration
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    spi_trace: Option<PathBuf>,
     #[command(flatten)]
     path: PathArgs,
     /// Run in real time: SCHED_FIFO and locked memory
@@ -90,8 +95,8 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let files = match Files::check(&args.path) {
-        Ok(files) => files,
+    let Checked { path, picture, spi_trace } = match Checked::check(args) {
+        Ok(checked) => checked,
         Err(error) => return failed(error),
     };
     let clock = Monotonic::start();
@@ -112,10 +117,16 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     let probe = board.probe();
-    if let Some(Err(error)) = camera.map(|camera| camera.start(probe.clone())) {
+    let sockets = runtime::socket_paths(&args.symlink);
+    let own =
+        match (args.show || camera.is_some()).then(|| OwnStatus::start(sockets.clone(), &args.symlink)).transpose() {
+            Ok(own) => own.unwrap_or_default(),
+            Err(error) => return failed(format!("the printer cannot be shown: {error}")),
+        };
+    if let Some(Err(error)) = camera.map(|camera| camera.start(probe.clone(), own.clone())) {
         return failed(error);
     }
-    let path = match files.map(|files| PathRecord::record(files, probe.clone())).transpose() {
+    let path = match path.map(|files| PathRecord::record(files, probe.clone())).transpose() {
         Ok(path) => path,
         Err(error) => return failed(format!("the path cannot be recorded: {error}")),
     };
@@ -128,10 +139,10 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         margin: MarginLimits::default(),
         watchdog: None,
         trace_edges: args.trace_edges,
-        sockets: runtime::socket_paths(&args.symlink),
+        sockets,
     };
-    if args.show || path.is_some() {
-        return serve(args, board, probe, &options, (recording, helpers), path);
+    if args.show || path.is_some() || spi_trace.is_some() {
+        return serve(args, board, (probe, own), &options, (recording, helpers), (path, spi_trace));
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set when the program is asked to end. A demonstration that this interrupts has not failed.
@@ -147,7 +158,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
             let demo = thread::Builder::new().name("demo".into()).spawn(move || {
                 // The link's thread starts it, and passes its real-time priority on.
                 realtime::leave();
-                show(&args, &plan, &probe, &right, &ended);
+                show(&args, &plan, &probe, picture.as_ref(), (&right, &ended));
             });
             if let Err(trouble) = runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
@@ -162,20 +173,44 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
+/// The files of the options, checked before the printer starts.
+struct Checked {
+    path: Option<Files>,
+    picture: Option<Output>,
+    spi_trace: Option<Output>,
+}
+
+impl Checked {
+    fn check(args: &SimArgs) -> Result<Checked, String> {
+        let inputs: Vec<&Path> = args.file.iter().chain(&args.path.compare).map(PathBuf::as_path).collect();
+        let output = |path: &Option<PathBuf>| path.as_deref().map(|path| Output::check(path, &inputs)).transpose();
+        let (picture, spi_trace) = (output(&args.picture)?, output(&args.spi_trace)?);
+        Ok(Checked { path: Files::check(&args.path, &inputs)?, picture, spi_trace })
+    }
+}
+
 /// Serves a host, without the demonstration. With `--show` it shows the effects on the printer.
 fn serve(
     args: &SimArgs,
     board: SimBoard,
-    probe: SimProbe,
+    (probe, own): (SimProbe, OwnStatus),
     options: &Options,
     (recording, helpers): (Recording, Helpers),
-    path: Option<PathRecord>,
+    (path, spi_trace): (Option<PathRecord>, Option<Output>),
 ) -> ExitCode {
-    let show = match args.show.then(|| Show::prepare(probe)).transpose() {
+    let show = match args.show.then(|| Show::prepare(probe.clone(), own)).transpose() {
         Ok(show) => show,
         Err(error) => return failed(format!("the printer cannot be shown: {error}")),
     };
+    // A start that fails makes no file.
+    let mut started = false;
     let ready = || {
+        started = true;
+        // No transfer comes before this.
+        match spi_trace.map(|trace| trace.make()).transpose() {
+            Ok(trace) => trace.into_iter().for_each(|file| probe.record_spi(file)),
+            Err(error) => log::error!("{error}"),
+        }
         if io::stdout().is_terminal() {
             tell_how_to_connect(args, if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
         }
@@ -188,13 +223,19 @@ fn serve(
     if let Some(show) = show {
         show.end();
     }
-    let written = path.map_or(ExitCode::SUCCESS, PathRecord::end);
+    let written = path.filter(|_| started).map_or(ExitCode::SUCCESS, PathRecord::end);
     ended.map_or_else(failed, |()| written)
 }
 
 /// Shows the printer at work, then ends the program or says how to use it with klippy.
-fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended: &AtomicBool) {
-    match demonstration(args, plan, probe) {
+fn show(
+    args: &SimArgs,
+    plan: &Plan,
+    probe: &SimProbe,
+    picture: Option<&Output>,
+    (right, ended): (&AtomicBool, &AtomicBool),
+) {
+    match demonstration(args, plan, probe, picture) {
         Err(_) if ended.load(Ordering::SeqCst) => return,
         Ok(all_right) => right.store(all_right, Ordering::SeqCst),
         Err(error) => log::error!("the demonstration: {error}"),
@@ -217,11 +258,11 @@ fn tell_how_to_connect(args: &SimArgs, end: &str) {
     tell("  klippy.py printer.cfg");
 }
 
-fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
+fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe, picture: Option<&Output>) -> Result<bool, String> {
     let mut client = Client::connect(&args.symlink, Duration::from_secs(5)).map_err(|error| error.to_string())?;
     let report = demonstrate(&mut client, plan, &mut ProgressLines::stdout()).map_err(|error| error.to_string())?;
-    if let Some(path) = &args.picture {
-        draw(path, &report)?;
+    if let Some(picture) = picture {
+        draw(picture, &report)?;
     }
     // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
@@ -250,10 +291,9 @@ fn tell(line: impl Display) {
     }
 }
 
-fn draw(path: &Path, report: &Report) -> Result<(), String> {
-    fs::write(path, picture::homing(report))
-        .map_err(|error| format!("{} cannot be written: {error}", path.display()))?;
-    tell(format_args!("drawn: {}", path.display()));
+fn draw(output: &Output, report: &Report) -> Result<(), String> {
+    output.write(|out| out.write_all(picture::homing(report).as_bytes()))?;
+    tell(format_args!("drawn: {}", output.path()));
     Ok(())
 }
 

@@ -24,14 +24,14 @@ use signal_hook::low_level::emulate_default_handler;
 use termina::escape::csi::{Csi, Cursor, DecPrivateMode, DecPrivateModeCode, Edit, EraseInDisplay, EraseInLine, Mode};
 use termina::event::{KeyCode, Modifiers};
 use termina::{Event, OneBased, Parser};
-use terminal_size::{Height, terminal_size_of};
+use terminal_size::{Height, Width, terminal_size_of};
 
 use crate::runtime::started;
 
 use super::page::draw;
 
-/// Rows of a terminal that does not report its size: the rows of the VT100.
-const ROWS: usize = 24;
+/// The size of a terminal that does not report it: that of the VT100.
+const VT100: Size = Size { rows: 24, columns: 80 };
 /// Longest wait for a terminal that takes no output, as after Ctrl-S, in milliseconds.
 const FAREWELL_MS: u16 = 1000;
 /// A row below the last one of any terminal. A terminal takes it for its last row.
@@ -42,6 +42,8 @@ const FIRST: OneBased = OneBased::from_zero_based(0);
 pub(super) const ERASE_LINE: Csi = Csi::Edit(Edit::EraseInLine(EraseInLine::EraseToEndOfLine));
 /// Erases the rest of the screen.
 pub(super) const ERASE_BELOW: Csi = Csi::Edit(Edit::EraseInDisplay(EraseInDisplay::EraseToEndOfDisplay));
+/// Deletes the cursor's row and all rows below it.
+pub(super) const DELETE_BELOW: Csi = Csi::Edit(Edit::DeleteLine(LAST_ROW as u32));
 /// Save and restore the cursor. Not all terminals know the sequences that termina has for it.
 pub(super) const SAVE_CURSOR: &str = "\x1b7";
 pub(super) const RESTORE_CURSOR: &str = "\x1b8";
@@ -76,9 +78,22 @@ fn row_number(row: usize) -> OneBased {
     OneBased::new(u16::try_from(row).unwrap_or(u16::MAX)).unwrap_or(FIRST)
 }
 
-/// The rows of the terminal on stdout.
-pub(super) fn rows() -> usize {
-    terminal_size_of(io::stdout()).map_or(ROWS, |(_, Height(rows))| rows.into())
+/// Moves the cursor up by this many rows, at least one.
+pub(super) fn up(rows: usize) -> Csi {
+    Csi::Cursor(Cursor::Up(u32::try_from(rows).unwrap_or(u32::MAX)))
+}
+
+/// The size of a terminal in characters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Size {
+    pub(super) rows: usize,
+    pub(super) columns: usize,
+}
+
+/// The size of the terminal on stdout.
+pub(super) fn size() -> Size {
+    terminal_size_of(io::stdout())
+        .map_or(VT100, |(Width(columns), Height(rows))| Size { rows: rows.into(), columns: columns.into() })
 }
 
 /// How to undo the changes.

@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs::{self, File};
-use std::io::{self, BufReader, BufWriter, Write};
+use std::io::{self, BufReader, BufWriter};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
@@ -23,6 +23,7 @@ use crate::trace::verdict::verdict;
 use crate::trace::{perfetto, svg, timeline, vcd};
 
 use super::failed;
+use super::files::Output;
 use super::page::{Page, aligned, print};
 use super::status::ask::fetch;
 
@@ -55,7 +56,7 @@ pub(super) struct TraceArgs {
     /// Write the events for ui.perfetto.dev
     #[arg(long, value_name = "OUT", value_hint = ValueHint::FilePath)]
     perfetto: Option<PathBuf>,
-    /// Draw the last 200 ms
+    /// Draw the verdict and 200 ms until 10 ms after the stop
     #[arg(long, value_name = "OUT", value_hint = ValueHint::FilePath)]
     svg: Option<PathBuf>,
     /// The link of the instance [default: any instance; with --live /tmp/klipper_host_mcu]
@@ -95,9 +96,9 @@ fn show(args: &TraceArgs) -> Result<(), String> {
     page.line(format_args!("verdict: {}", verdict(&trace).text));
     let (at, head) = (utc_text(trace.head.utc_ms), &trace.head);
     page.line(format_args!("{}: {} at {}, until {at}", from.display(), head.version, head.link));
-    export(&trace, args.vcd.as_deref(), vcd::write)?;
-    export(&trace, args.perfetto.as_deref(), perfetto::write)?;
-    export(&trace, args.svg.as_deref(), svg::write)?;
+    export(&trace, &from, args.vcd.as_deref(), vcd::write)?;
+    export(&trace, &from, args.perfetto.as_deref(), perfetto::write)?;
+    export(&trace, &from, args.svg.as_deref(), svg::write)?;
     if args.vcd.is_none() && args.perfetto.is_none() && args.svg.is_none() {
         let mut text = Vec::new();
         timeline::write(&trace, shown, &mut text).map_err(|error| error.to_string())?;
@@ -107,19 +108,15 @@ fn show(args: &TraceArgs) -> Result<(), String> {
     print(&page)
 }
 
-/// Writes a file for another program, if it was asked for.
+/// Writes a file for another program, if it was asked for. The recording itself, in `from`, stays.
 fn export(
     trace: &Trace,
+    from: &Path,
     path: Option<&Path>,
     write: impl Fn(&Trace, &mut BufWriter<File>) -> io::Result<()>,
 ) -> Result<(), String> {
     let Some(path) = path else { return Ok(()) };
-    let written = File::create(path).and_then(|file| {
-        let mut out = BufWriter::new(file);
-        write(trace, &mut out)?;
-        out.flush()
-    });
-    written.map_err(|error| format!("{} cannot be written: {error}", path.display()))
+    Output::check(path, &[from])?.write(|out| write(trace, out))
 }
 
 fn list(args: &TraceArgs) -> Result<(), String> {
@@ -145,7 +142,7 @@ fn traces(args: &TraceArgs) -> Result<Vec<PathBuf>, String> {
     let folders = folders();
     let found = match &args.symlink {
         None => all(&folders),
-        Some(link) => folders.iter().flat_map(|folder| kept(folder, &name_of(link))).collect(),
+        Some(link) => kept(&folders, &name_of(link)),
     };
     // The service's folder may be closed to this user.
     let closed = folders.iter().find_map(|folder| {

@@ -13,7 +13,7 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::foreign;
-use crate::proc::stat_field;
+use crate::proc::{stat_field, status_field};
 
 /// Longest part of a command line that is looked at. A process may have one of megabytes.
 const COMMAND_LINE_BYTES_MAX: u64 = 16 << 10;
@@ -23,6 +23,11 @@ const PROC_BYTES_MAX: u64 = 4096;
 const STARTTIME: usize = 22;
 /// Highest number of open files of a process that are looked at. klippy has less than a hundred.
 const OPEN_FILES_MAX: usize = 4096;
+/// Highest number of open files that are looked at of all processes that may not open the terminal. Any user can have
+/// many processes with many files. A look takes 2 us to 20 us.
+const UNLIKELY_FILES_MAX: usize = 10_000;
+/// The major numbers of pseudo terminals (admin-guide/devices.txt).
+const PSEUDO_MAJORS: std::ops::RangeInclusive<u64> = 136..=143;
 
 /// A process that may be a host.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -48,11 +53,14 @@ pub enum Search {
 }
 
 /// A terminal by its numbers: its own, and the number of the devpts that it is on. Containers have terminals of the
-/// same numbers, on devices of their own.
+/// same numbers, on devices of their own. Its owner, group and mode say who may open it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Terminal {
     number: u64,
     devpts: u64,
+    owner: u32,
+    group: u32,
+    mode: u32,
 }
 
 impl Terminal {
@@ -62,11 +70,61 @@ impl Terminal {
     ///
     /// The device cannot be looked at.
     pub fn of(device: &Path) -> io::Result<Terminal> {
-        fs::metadata(device).map(|about| Terminal { number: about.rdev(), devpts: about.dev() })
+        fs::metadata(device).map(|about| Terminal {
+            number: about.rdev(),
+            devpts: about.dev(),
+            owner: about.uid(),
+            group: about.gid(),
+            mode: about.mode(),
+        })
+    }
+
+    /// Whether these users may open it.
+    fn lets_in(self, ids: &Ids) -> bool {
+        const READ_WRITE: u32 = 6;
+        ids.may(READ_WRITE, (self.owner, self.group, self.mode))
     }
 
     fn is(self, file: &fs::Metadata) -> bool {
         file.file_type().is_char_device() && (file.rdev(), file.dev()) == (self.number, self.devpts)
+    }
+}
+
+/// The users and groups of a process (proc_pid_status(5)).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ids {
+    /// The user that started it, the effective one, the saved one, and the one for files.
+    pub uids: Vec<u32>,
+    /// The effective group, and the further ones.
+    pub gids: Vec<u32>,
+}
+
+impl Ids {
+    /// The ones in a text of /proc/PID/status.
+    pub fn of(status: &str) -> Option<Ids> {
+        let numbers = |field: &str| -> Vec<u32> {
+            let numbers = status_field(status, field).unwrap_or_default().split_whitespace();
+            numbers.filter_map(|number| number.parse().ok()).collect()
+        };
+        let uids = numbers("Uid");
+        let gids = numbers("Gid").get(1).copied().into_iter().chain(numbers("Groups")).collect();
+        (uids.len() >= 2).then_some(Ids { uids, gids })
+    }
+
+    /// The effective user.
+    pub fn user(&self) -> u32 {
+        self.uids[1]
+    }
+
+    /// Whether a file's owner, group and mode give them this access (path_resolution(7)).
+    pub fn may(&self, access: u32, (owner, group, mode): (u32, u32, u32)) -> bool {
+        let bits = match () {
+            () if self.user() == 0 => return true,
+            () if owner == self.user() => mode >> 6,
+            () if self.gids.contains(&group) => mode >> 3,
+            () => mode,
+        };
+        bits & access == access
     }
 }
 
@@ -76,37 +134,37 @@ impl Terminal {
 ///
 /// `proc` itself cannot be looked at.
 pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
-    let mut klippys = Vec::new();
-    let mut others = Vec::new();
-    for pid in pids(proc)? {
-        let arguments = arguments(proc, pid);
-        if klippy(&arguments).is_some() {
-            klippys.extend(Process::read(proc, pid, arguments));
-        } else if !arguments.is_empty() {
-            others.push(pid);
-        }
-    }
-    // A look into a process costs a call for each of its files. So the likely processes come first, and a parent comes
-    // before its children.
-    klippys.sort_by_key(|process| process.started);
+    // The kernel does not say who has a terminal open. A look into a process costs a call for each of its files. So the
+    // processes that may open the terminal come first, klippys come before others, and a parent comes before its
+    // children.
+    let candidate = |process: Process| {
+        let status = foreign::read(&proc.join(process.pid.to_string()).join("status"), PROC_BYTES_MAX).ok()?;
+        let is_let_in = Ids::of(&String::from_utf8_lossy(&status)).is_some_and(|ids| terminal.lets_in(&ids));
+        Some((!is_let_in, !process.is_klippy(), process.started, process.pid, process))
+    };
+    let mut candidates: Vec<_> = all(proc)?.into_iter().filter_map(candidate).collect();
+    candidates.sort_by_key(|(refused, other, started, pid, _)| (*refused, *other, *started, *pid));
     let mut hidden = Vec::new();
-    for process in klippys {
-        match has_open(proc, process.pid, terminal) {
-            Ok(true) if !serves(proc, process.pid, terminal) => return Ok(Search::Found(process)),
-            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => hidden.push(process),
+    let mut unlikely = UNLIKELY_FILES_MAX;
+    for (is_refused, _, _, pid, process) in candidates {
+        let mut files = OPEN_FILES_MAX;
+        let left = if is_refused { &mut unlikely } else { &mut files };
+        match has_open(proc, pid, terminal, left) {
+            Ok(true) if !serves(proc, pid, terminal) => return Ok(Search::Found(process)),
+            // A process that may not open the terminal is no host that is hidden.
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied && !is_refused && process.is_klippy() => {
+                hidden.push(process);
+            }
             // It is not the host, or it ended meanwhile.
             Ok(_) | Err(_) => {}
         }
     }
-    for pid in others {
-        if let Ok(true) = has_open(proc, pid, terminal)
-            && !serves(proc, pid, terminal)
-            && let Some(process) = Process::read(proc, pid, arguments(proc, pid))
-        {
-            return Ok(Search::Found(process));
-        }
-    }
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
+}
+
+/// Whether a file is a pseudo terminal.
+pub(crate) fn is_pseudo_terminal(file: &fs::Metadata) -> bool {
+    file.file_type().is_char_device() && PSEUDO_MAJORS.contains(&nix::sys::stat::major(file.rdev()))
 }
 
 /// The process, other than this one, that serves the terminal `device`: it has the master end open. `None` if this
@@ -121,13 +179,19 @@ pub fn server(proc: &Path, device: &Path) -> io::Result<Option<Process>> {
     Ok(pid.and_then(|pid| Process::read(proc, pid, arguments(proc, pid))))
 }
 
-/// All processes except this one.
+/// All processes except this one and the kernel's threads, which have no command line.
 ///
 /// # Errors
 ///
 /// `proc` itself cannot be looked at.
 pub fn all(proc: &Path) -> io::Result<Vec<Process>> {
-    Ok(pids(proc)?.filter_map(|pid| Process::read(proc, pid, arguments(proc, pid))).collect())
+    let named = pids(proc)?.map(|pid| (pid, arguments(proc, pid))).filter(|(_, arguments)| !arguments.is_empty());
+    Ok(named.filter_map(|(pid, arguments)| Process::read(proc, pid, arguments)).collect())
+}
+
+/// The process with this number.
+pub fn of(proc: &Path, pid: u32) -> Option<Process> {
+    Process::read(proc, pid, arguments(proc, pid))
 }
 
 /// The numbers of all processes except this one.
@@ -174,6 +238,11 @@ impl Process {
         self.reach(proc, klippy_config(&self.arguments)?)
     }
 
+    /// klippy's API server as this program can reach it. `None` without one, or if the process is not klippy.
+    pub fn klippy_api(&self, proc: &Path) -> Option<PathBuf> {
+        self.reach(proc, klippy_api(&self.arguments)?)
+    }
+
     /// A path of the process as this program can reach it. It leads through the process's own root (a container's). If
     /// that is not permitted, both are taken to have the same root.
     fn reach(&self, proc: &Path, path: &Path) -> Option<PathBuf> {
@@ -188,13 +257,23 @@ impl Process {
 }
 
 /// The systemd unit that a text of /proc/PID/cgroup names, without `.service` (systemd.resource-control(5)). `None` if
-/// the process was started from a user's session or manager, which `sudo systemctl` does not reach.
+/// the process was started from a user's session or manager, which `sudo systemctl` does not reach, or in a container.
+///
+/// Only root and systemd make groups outside of a user's slice. Below a user's manager and in a container, others make
+/// groups of any name. So the unit is what stands in systemd's own hierarchy directly in a slice of the system.
 pub(crate) fn unit(groups: &str) -> Option<&str> {
-    let is_user = |name: &str| name.starts_with("user@") || name.starts_with("user-");
-    if groups.split(['/', '\n']).any(is_user) {
-        return None;
-    }
-    groups.lines().find_map(|line| line.rsplit('/').next()?.strip_suffix(".service"))
+    let path = groups.lines().find_map(|line| {
+        let (_, rest) = line.split_once(':')?;
+        let (controllers, path) = rest.split_once(':')?;
+        ["", "name=systemd"].contains(&controllers).then_some(path).filter(|path| *path != "/")
+    })?;
+    let mut names = path.strip_prefix('/')?.split('/').skip_while(|name| is_slice_of_the_system(name));
+    names.next()?.strip_suffix(".service").filter(|unit| !unit.is_empty() && !unit.starts_with("user@"))
+}
+
+fn is_slice_of_the_system(name: &str) -> bool {
+    let of_others = ["user.slice", "machine.slice"].contains(&name) || name.starts_with("user-");
+    name.ends_with(".slice") && !of_others
 }
 
 /// The command line of a process. It is empty for the kernel's threads.
@@ -255,6 +334,13 @@ pub(crate) fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
     None
 }
 
+/// The socket of the API server that klippy's command line names.
+pub(crate) fn klippy_api(arguments: &[PathBuf]) -> Option<&Path> {
+    let (at, _) = program(arguments)?;
+    let is_option = |word: &PathBuf| word.as_os_str() == "-a" || word.as_os_str() == "--api-server";
+    arguments[at + 1..].windows(2).find(|pair| is_option(&pair[0])).map(|pair| pair[1].as_path())
+}
+
 /// Highest number of links that the kernel follows in a path.
 const LINKS_MAX: usize = 40;
 
@@ -300,9 +386,13 @@ fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
     told.any(|info| info.split(|byte| *byte == b'\n').any(|line| line == index.as_bytes()))
 }
 
-/// Whether a process has the terminal open.
-fn has_open(proc: &Path, pid: u32, terminal: Terminal) -> io::Result<bool> {
-    for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))?.take(OPEN_FILES_MAX) {
+/// Whether a process has the terminal open. `left` is the number of files to look at.
+fn has_open(proc: &Path, pid: u32, terminal: Terminal, left: &mut usize) -> io::Result<bool> {
+    for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))? {
+        if *left == 0 {
+            break;
+        }
+        *left -= 1;
         let file = match fs::metadata(entry?.path()) {
             // The file was closed meanwhile.
             Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
@@ -406,6 +496,62 @@ mod tests {
         host.wait().unwrap();
     }
 
+    /// A folder like /proc, with a process of this user and this group that has these files open.
+    fn put(proc: &Path, pid: u32, arguments: &[&str], (uid, gid): (u32, u32), files: &[&Path]) {
+        let folder = proc.join(pid.to_string());
+        fs::create_dir_all(folder.join("fd")).unwrap();
+        fs::write(folder.join("cmdline"), arguments.join("\0")).unwrap();
+        fs::write(folder.join("stat"), format!("{pid} (x) S {} 0", ["1"; 20].join(" "))).unwrap();
+        let status = format!("Uid:\t{uid}\t{uid}\t{uid}\t{uid}\nGid:\t{gid}\t{gid}\t{gid}\t{gid}\nGroups:\t\n");
+        fs::write(folder.join("status"), status).unwrap();
+        for (number, file) in files.iter().enumerate() {
+            std::os::unix::fs::symlink(file, folder.join("fd").join(number.to_string())).unwrap();
+        }
+    }
+
+    #[test]
+    fn processes_that_may_not_open_the_terminal_come_last_and_only_some_of_their_files_are_looked_at() {
+        const KLIPPY: [&str; 2] = ["python3", "/tmp/klippy/klippy.py"];
+        let (_pty, device) = terminal();
+        let terminal = Terminal { owner: 990, group: 5, mode: 0o20660, ..Terminal::of(&device).unwrap() };
+        let proc = tempfile::tempdir().unwrap();
+        let null = Path::new("/dev/null");
+        let found = || match find(proc.path(), terminal).unwrap() {
+            Search::Found(process) => Some(process.pid),
+            _ => None,
+        };
+        // Another user's, older than the host. It got the terminal from somebody who may open it.
+        put(proc.path(), 10, &KLIPPY, (54_321, 54_321), &[null, &device]);
+        assert_eq!(found(), Some(10), "a terminal may be handed on");
+        // A host that is no klippy, of a member of the terminal's group.
+        put(proc.path(), 90, &["host"], (1000, 5), &[null, &device]);
+        assert_eq!(found(), Some(90));
+        put(proc.path(), 91, &KLIPPY, (1000, 5), &[&device]);
+        assert_eq!(found(), Some(91), "klippys come before others");
+        for pid in [10, 90, 91] {
+            fs::remove_dir_all(proc.path().join(pid.to_string())).unwrap();
+        }
+        let many = vec![null; UNLIKELY_FILES_MAX / 4];
+        (10..15).for_each(|pid| put(proc.path(), pid, &KLIPPY, (54_321, 54_321), &many));
+        put(proc.path(), 20, &KLIPPY, (54_321, 54_321), &[&device]);
+        assert_eq!(found(), None, "the search has an end");
+        put(proc.path(), 90, &["host"], (990, 990), &[&device]);
+        assert_eq!(found(), Some(90), "the terminal's owner");
+    }
+
+    #[test]
+    fn access_is_given_by_owner_group_and_mode() {
+        let of = |uids: &str, groups: &str| {
+            Ids::of(&format!("Name:\tx\nUid:\t{uids}\nGid:\t7\t8\t8\t8\nGroups:\t{groups}\n")).unwrap()
+        };
+        let may = |ids: &Ids, mode| ids.may(6, (1000, 5, mode));
+        assert!(may(&of("1\t0\t1\t1", ""), 0o000), "root");
+        assert!(may(&of("1\t1000\t1\t1", ""), 0o600) && !may(&of("1\t1000\t1\t1", "5"), 0o066));
+        assert!(may(&of("2\t2\t2\t2", "4 5"), 0o060) && !may(&of("2\t2\t2\t2", "5"), 0o606));
+        assert!(may(&of("2\t2\t2\t2", "4"), 0o006) && !may(&of("2\t2\t2\t2", "4"), 0o664));
+        assert_eq!(Ids::of("Name:\tx\n"), None);
+    }
+
     #[test]
     fn a_name_may_hold_anything() {
         let proc = tempfile::tempdir().unwrap();
@@ -431,6 +577,20 @@ mod tests {
         assert_eq!(folder("python3 -m klippy p.cfg"), Some("klippy".into()));
         assert_eq!(folder("python3 -m klippy.klippy p.cfg"), Some("klippy".into()));
         assert_eq!(folder("python3 -m http.server klippy"), None);
+    }
+
+    #[test]
+    fn the_api_server_is_the_one_of_klippy_s_options() {
+        let api = |line: &str| {
+            let arguments: Vec<PathBuf> = line.split(' ').map(PathBuf::from).collect();
+            klippy_api(&arguments).map(Path::to_owned)
+        };
+        let socket = Some("/c/klippy.sock".into());
+        assert_eq!(api("python3 /a/klippy/klippy.py /b/p.cfg -I /c/tty -a /c/klippy.sock -l /c/log"), socket);
+        assert_eq!(api("python3 -m klippy --api-server /c/klippy.sock /b/p.cfg"), socket);
+        for none in ["python3 /a/klippy.py /b/p.cfg", "python3 /a/klippy.py /b/p.cfg -a", "socat -a /c/klippy.sock"] {
+            assert_eq!(api(none), None, "{none}");
+        }
     }
 
     #[test]

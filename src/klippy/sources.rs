@@ -100,7 +100,14 @@ impl Sources {
                 entries => entries?,
             };
             for entry in entries {
-                let entry = entry?;
+                // The checkout may change meanwhile: an update, or a plugin that is installed.
+                let entry = match entry {
+                    Err(error) => {
+                        sources.leave_out(&folder, &error);
+                        break;
+                    }
+                    Ok(entry) => entry,
+                };
                 let path = entry.path();
                 if names == NAMES_MAX || files == FILES_MAX || sources.bytes >= BYTES_MAX {
                     return Ok(sources);
@@ -111,7 +118,7 @@ impl Sources {
                     if let Err(error) = sources.add(&path) {
                         sources.leave_out(&path, &error);
                     }
-                } else if depth < DEPTH_MAX && !entry.file_type()?.is_file() && path.is_dir() {
+                } else if depth < DEPTH_MAX && entry.file_type().is_ok_and(|kind| !kind.is_file()) && path.is_dir() {
                     folders.push_back((path, depth + 1));
                 }
             }
@@ -247,6 +254,39 @@ mod tests {
         {
             assert_eq!(shape(text), None, "{text}");
         }
+    }
+
+    #[test]
+    fn a_checkout_may_change_while_it_is_read() {
+        use std::sync::atomic::{AtomicBool, Ordering};
+        const ROUNDS: usize = 50;
+        let folder = tempfile::tempdir().unwrap();
+        let here = folder.path();
+        fs::write(here.join("mcu.py"), "a('trsync_start oid=%c report_clock=%u')").unwrap();
+        let is_over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let (extras, file) = (here.join("extras"), here.join("extras/bus.py"));
+                while !is_over.load(Ordering::Relaxed) {
+                    // A file that appears, grows, shrinks, becomes a link, and goes with its folder.
+                    let _ = fs::create_dir(&extras);
+                    let _ = fs::write(&file, "b = 'i2c_write oid=%c data=%*s'".repeat(1000));
+                    let _ = fs::write(&file, "b = 'i2c_wr");
+                    let _ = fs::remove_file(&file);
+                    let _ = std::os::unix::fs::symlink("../mcu.py", &file);
+                    let _ = fs::rename(&extras, here.join("gone"));
+                    let _ = fs::remove_dir_all(here.join("gone"));
+                    let _ = std::os::unix::fs::symlink("/nonexistent", &extras);
+                    let _ = fs::remove_file(&extras);
+                }
+            });
+            let sources: Vec<_> = (0..ROUNDS).map(|_| Sources::read(here)).collect();
+            is_over.store(true, Ordering::Relaxed);
+            for sources in sources {
+                let shapes = sources.unwrap().shapes;
+                assert!(shapes.contains(&Shape("trsync_start oid report_clock".into())), "{shapes:?}");
+            }
+        });
     }
 
     #[test]

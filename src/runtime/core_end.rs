@@ -129,8 +129,8 @@ impl CoreEnd {
 
     /// Logs the core's lines.
     pub(super) fn log_lines(&mut self) {
-        while let Some((level, line)) = self.inlet.line() {
-            log!(level, "{line}");
+        while let Some((level, line, kind)) = self.inlet.line() {
+            log!(target: line.get(..kind).unwrap_or_default(), level, "{line}");
         }
     }
 }

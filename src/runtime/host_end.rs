@@ -5,6 +5,7 @@
 
 use std::io;
 use std::os::fd::BorrowedFd;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -104,6 +105,11 @@ impl HostEnd {
         self.link.due().is_none()
     }
 
+    /// The terminal that a host on this computer opens.
+    pub(super) fn terminal(&self) -> Option<&Path> {
+        self.link.terminal()
+    }
+
     /// Whether the link is there. A port or an interface may come later.
     pub(super) fn is_open(&self) -> bool {
         self.link.event().is_some()
@@ -121,6 +127,7 @@ impl HostEnd {
     /// Shows whether a host is there, and returns a line about it for the service manager.
     pub(super) fn tell(&self) -> String {
         self.shown.attach(self.is_attached);
+        self.shown.serve_on(self.link.detail());
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
         format!("{} {}, {host}", serving(self.is_open()), self.link.place())
     }
@@ -133,16 +140,21 @@ impl HostEnd {
             heard => {
                 read.is_over = heard == Heard::Over;
                 read.is_gone = true;
-                self.part()?;
+                self.part();
                 return Ok(read);
             }
         };
         let fresh = self.filled..self.filled + bytes;
         self.filled = fresh.end;
-        if bytes > 0 && !self.is_attached && self.link.meet_host()? {
-            self.is_attached = true;
-            read.is_new_host = true;
-            info!("host attached");
+        if bytes > 0 && !self.is_attached {
+            if self.link.meet_host() {
+                self.is_attached = true;
+                read.is_new_host = true;
+                info!("host attached");
+            } else {
+                // The writer may have left the terminal useless, and another one is in place.
+                self.shown.serve_on(self.link.detail());
+            }
         }
         if let Some(silence_max) = self.silence_max.filter(|_| self.is_attached) {
             let now = monotonic();
@@ -150,7 +162,7 @@ impl HostEnd {
                 self.silent_until = Some(now + silence_max);
             } else if self.silent_until.is_some_and(|until| now >= until) {
                 read.is_gone = true;
-                self.part()?;
+                self.part();
             }
         }
         read.is_sign = bytes > 0 && self.input[..self.filled].iter().all(|byte| *byte == SYNC);
@@ -168,13 +180,12 @@ impl HostEnd {
     }
 
     /// The host is gone.
-    fn part(&mut self) -> io::Result<()> {
-        self.link.part_from_host()?;
+    fn part(&mut self) {
+        self.link.part_from_host();
         self.is_attached = false;
         self.silent_until = None;
         self.output.clear();
         info!("host gone");
-        Ok(())
     }
 
     /// The next block of the input.

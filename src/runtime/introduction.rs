@@ -92,13 +92,13 @@ impl Introduction {
         self.dialects[0].clone()
     }
 
-    /// A host has come.
-    pub(super) fn begin(&mut self) {
+    /// A host has come, and has `terminal` open.
+    pub(super) fn begin(&mut self, terminal: Option<&Path>) {
         if let Some(surveyor) = &mut self.surveyor {
             surveyor.ask();
         }
         if let Some(finder) = &mut self.finder {
-            finder.ask();
+            finder.ask(terminal);
             self.is_overdue = false;
         }
         if self.surveyor.is_some() || self.finder.is_some() {

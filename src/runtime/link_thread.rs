@@ -288,7 +288,7 @@ impl LinkThread {
             self.tell_status();
         }
         if read.is_new_host {
-            self.introduction.begin();
+            self.introduction.begin(self.host.terminal());
             self.record(Event::HostCame);
         }
         if read.is_sign {
@@ -348,7 +348,7 @@ impl LinkThread {
                 Next::Block(payload) => {
                     let at = self.clock.now();
                     let event = if self.answer(&payload, at) {
-                        Event::Answered { id: Reader::new(payload.as_slice()).int().unwrap_or(0) as u16 }
+                        Event::Answered { id: Reader::new(payload.as_slice()).int().unwrap_or(0) as i16 }
                     } else {
                         let stops = self.known.dialect.is_emergency(payload.as_slice());
                         self.core.hand(payload, stops);

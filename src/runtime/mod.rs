@@ -73,6 +73,7 @@ pub use host::HostSearch;
 pub use link::LinkName;
 pub use link::can::{CanbusUuid, can_open, uuid as can_uuid};
 pub use link::pty::Access;
+pub(crate) use link::stdio::give_back;
 pub use place::Place;
 pub use recorder::Recording;
 pub use served::{Served, served};
@@ -143,6 +144,7 @@ pub fn run(
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
     let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
+    shown.serve_on(link.detail());
     let dialect = options.dialect.or_else(|| (!options.link.is_local()).then_some(DialectName::Union));
     if options.dialect.is_none() && !options.link.is_local() {
         info!(
@@ -154,7 +156,6 @@ pub fn run(
     let (teller, asker) = status::ends();
     let facts = Facts {
         link: link.place(),
-        terminal: link.detail(),
         board: board.describe(),
         pins: board.pins(),
         view: board.view(),

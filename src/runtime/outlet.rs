@@ -24,8 +24,8 @@ const RING_BYTES: usize = 1 << 16;
 const HEAD_BYTES: usize = 6;
 /// Longest line for the log. A longer one is cut.
 const LINE_BYTES: usize = 1024;
-/// Size of the head of a line in the ring: its level and its length.
-const LINE_HEAD_BYTES: usize = 3;
+/// Size of the head of a line in the ring: its level, its length, and how much of its text names its kind.
+const LINE_HEAD_BYTES: usize = 4;
 /// Size of the ring of lines.
 const LINES_BYTES: usize = 1 << 15;
 /// The part of that ring that is kept free for the line with the reason of a stop. That line comes last. Before it,
@@ -110,8 +110,9 @@ fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
 }
 
 impl Outlet {
-    /// Puts a line into its ring, or drops it if fewer than `spare` bytes would stay free.
-    fn line(&mut self, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
+    /// Puts a line into its ring, or drops it if fewer than `spare` bytes would stay free. The log limits the lines of
+    /// one kind. The first `kind` bytes name it.
+    fn line(&mut self, kind: usize, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
         let mut text = [0; LINE_BYTES];
         let mut rest = &mut text[..];
         // The write fails when the text is full. The line is cut there.
@@ -119,9 +120,15 @@ impl Outlet {
         let len = LINE_BYTES - rest.len();
         if self.lines.slots() >= LINE_HEAD_BYTES + len + spare {
             let [low, high] = (len as u16).to_le_bytes();
-            push(&mut self.lines, &[level as u8, low, high], &text[..len]);
+            push(&mut self.lines, &[level as u8, low, high, kind.min(len) as u8], &text[..len]);
         }
         self.wake.wake();
+    }
+
+    /// The same for a line about a stop. Its kind is `what`, with the reason.
+    fn stop_line(&mut self, what: &str, level: Level, spare: usize, shutdown: &Shutdown) {
+        let kind = what.len() + shutdown.reason.text().len();
+        self.line(kind, level, spare, format_args!("{what}{shutdown}"));
     }
 }
 
@@ -136,28 +143,21 @@ impl Outbox for Outlet {
     }
 
     fn note(&mut self, note: Note<'_>) {
+        // Names and counts come after the part that is the kind.
+        let mut line = |kind: &str, line: std::fmt::Arguments<'_>| {
+            self.line(kind.len(), Level::Info, LINES_SPARE, line);
+        };
         match note {
-            Note::Shutdown(shutdown) => {
-                self.line(gravity(shutdown), 0, format_args!("shutdown: {shutdown}"));
-            }
-            Note::Warning(shutdown) => self.line(Level::Warn, LINES_SPARE, format_args!("{shutdown}")),
-            Note::Trouble(shutdown) => {
-                self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
-            }
-            Note::Safe(name) => {
-                self.line(Level::Info, LINES_SPARE, format_args!("{name} is at its shutdown value after all"));
-            }
+            Note::Shutdown(shutdown) => self.stop_line("shutdown: ", gravity(shutdown), 0, shutdown),
+            Note::Warning(shutdown) => self.stop_line("", Level::Warn, LINES_SPARE, shutdown),
+            Note::Trouble(shutdown) => self.stop_line("while shut down: ", gravity(shutdown), LINES_SPARE, shutdown),
+            Note::Safe(name) => line("", format_args!("{name} is at its shutdown value after all")),
             Note::Lateness(lateness, margin) => {
                 let margin = us(margin);
-                let line = format_args!("timers: {lateness}; the core wakes {margin:.1} us early");
-                self.line(Level::Info, LINES_SPARE, line);
+                line("timers: ", format_args!("timers: {lateness}; the core wakes {margin:.1} us early"));
             }
-            Note::Reset => {
-                self.line(Level::Info, LINES_SPARE, format_args!("configuration dropped, waiting for a new one"));
-            }
-            Note::Configured(kinds) => {
-                self.line(Level::Info, LINES_SPARE, format_args!("configured: {}", Kinds(kinds)));
-            }
+            Note::Reset => line("configuration", format_args!("configuration dropped, waiting for a new one")),
+            Note::Configured(kinds) => line("configured: ", format_args!("configured: {}", Kinds(kinds))),
         }
     }
 }
@@ -197,16 +197,16 @@ impl Inlet {
         Some((pop(&mut self.responses, &mut self.payload[..len])?, u32::from_le_bytes(begun)))
     }
 
-    /// The next line for the log.
-    pub(super) fn line(&mut self) -> Option<(Level, String)> {
+    /// The next line for the log, and how many of its bytes name its kind.
+    pub(super) fn line(&mut self) -> Option<(Level, String, usize)> {
         let mut head = [0; LINE_HEAD_BYTES];
         pop(&mut self.lines, &mut head)?;
-        let [level, low, high] = head;
+        let [level, low, high, kind] = head;
         let level = [Level::Error, Level::Warn].into_iter().find(|known| *known as u8 == level).unwrap_or(Level::Info);
         let mut text = [0; LINE_BYTES];
         let len = usize::from(u16::from_le_bytes([low, high])).min(LINE_BYTES);
         let text = pop(&mut self.lines, &mut text[..len])?;
-        Some((level, String::from_utf8_lossy(text).into_owned()))
+        Some((level, String::from_utf8_lossy(text).into_owned(), kind.into()))
     }
 
     pub(super) fn has_response(&self) -> bool {
@@ -245,7 +245,7 @@ mod tests {
         }
         outlet.note(Note::Shutdown(&Shutdown::because(reason::ADC_READ, "oid 3")));
         assert!(inlet.has_line());
-        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: Error on analog read: oid 3".into())));
+        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: Error on analog read: oid 3".into(), 30)));
         assert_eq!(inlet.line(), None);
         let mut whole = 0;
         while let Some((response, 1)) = inlet.response() {
@@ -266,11 +266,11 @@ mod tests {
         let reason = format!("M112 {}", "of this host ".repeat(LINE_BYTES));
         outlet.note(Note::Shutdown(&Shutdown::because(reason::COMMAND_REQUEST, reason)));
         let mut lines: Vec<_> = std::iter::from_fn(|| inlet.line()).collect();
-        let (level, line) = lines.pop().unwrap();
+        let (level, line, _) = lines.pop().unwrap();
         assert_eq!(level, Level::Info);
         assert!(line.starts_with("shutdown: Command request: M112 of this host"), "{line}");
         assert!(lines.len() > 20);
-        assert!(lines.iter().all(|(level, line)| *level == Level::Error && line.len() == LINE_BYTES));
+        assert!(lines.iter().all(|(level, line, _)| *level == Level::Error && line.len() == LINE_BYTES));
     }
 
     #[test]
@@ -279,7 +279,8 @@ mod tests {
         let end = Shutdown::because(reason::FORCE_SHUTDOWN, "the end");
         outlet.note(Note::Shutdown(&end));
         outlet.note(Note::Trouble(&end));
-        assert_eq!(inlet.line(), Some((Level::Info, "shutdown: Force shutdown command: the end".into())));
-        assert_eq!(inlet.line(), Some((Level::Info, "while shut down: Force shutdown command: the end".into())));
+        assert_eq!(inlet.line(), Some((Level::Info, "shutdown: Force shutdown command: the end".into(), 32)));
+        let line = "while shut down: Force shutdown command: the end".to_owned();
+        assert_eq!(inlet.line(), Some((Level::Info, line, 39)));
     }
 }

@@ -6,16 +6,12 @@
 
 use std::fmt;
 use std::fs::{self, Metadata};
-use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use nix::sys::stat::major;
-
 use crate::foreign;
-use crate::klippy::process::{self, Process, server};
+use crate::klippy::process::{self, Process, is_pseudo_terminal, server};
 
-/// The major numbers of pseudo terminals (admin-guide/devices.txt).
-const PTS_MAJORS: std::ops::RangeInclusive<u64> = 136..=143;
 /// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
 /// Longest part of /proc/PID/cgroup that is looked at.
@@ -31,8 +27,8 @@ const PROGRAMS: [(&str, &str); 2] = [("pinion", "Pinion"), ("klipper_mcu", "Klip
 pub struct Served {
     link: PathBuf,
     device: PathBuf,
-    /// The program's name for people.
-    program: &'static str,
+    /// The program's name for people. `None` if it is none that serves hosts.
+    program: Option<&'static str>,
     pid: Option<u32>,
     unit: Option<String>,
 }
@@ -45,7 +41,7 @@ pub fn served(link: &Path) -> Option<Served> {
     let way = follow(link);
     let [.., last_link, device] = &way[..] else { return None };
     let terminal = fs::metadata(device).ok()?;
-    if !terminal.file_type().is_char_device() || !PTS_MAJORS.contains(&major(terminal.rdev())) {
+    if !is_pseudo_terminal(&terminal) {
         return None;
     }
     let proc = Path::new("/proc");
@@ -65,7 +61,7 @@ pub fn served(link: &Path) -> Option<Served> {
     Some(Served {
         link: link.to_owned(),
         device: device.clone(),
-        program: server.as_ref().and_then(known).unwrap_or("another program"),
+        program: server.as_ref().and_then(known),
         pid: server.map(|process| process.pid),
         // A program that cron started, for example, belongs to cron's unit.
         unit: unit.filter(|unit| unit.contains("pinion") || unit.contains("klipper")).map(str::to_owned),
@@ -131,11 +127,15 @@ fn hidden_server(proc: &Path, way: &[PathBuf], terminal: &Metadata) -> Option<Pr
 impl fmt::Display for Served {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Served { link, device, program, pid, unit } = self;
-        write!(f, "{} leads to {}, which {program} serves", link.display(), device.display())?;
-        match (unit, pid) {
-            (Some(unit), Some(pid)) => write!(f, " (process {pid}): stop it (sudo systemctl stop {unit})"),
-            (None, Some(pid)) => write!(f, " (process {pid}): stop it (sudo kill {pid})"),
-            (_, None) => write!(f, ": stop it (sudo pinion doctor may name it)"),
+        let served_by = program.unwrap_or("another program");
+        write!(f, "{} leads to {}, which {served_by} serves", link.display(), device.display())?;
+        pid.map_or(Ok(()), |pid| write!(f, " (process {pid})"))?;
+        match (program, unit, pid) {
+            // Any user can make a link in /tmp to any terminal, such as the one of root's login.
+            (None, _, Some(_)) => write!(f, ": remove the link, unless that program has made it"),
+            (_, Some(unit), Some(_)) => write!(f, ": stop it (sudo systemctl stop {})", foreign::word(unit)),
+            (_, None, Some(pid)) => write!(f, ": stop it (sudo kill {pid})"),
+            (.., None) => write!(f, ": stop it (sudo pinion doctor may name it)"),
         }
     }
 }
@@ -186,14 +186,23 @@ mod tests {
 
     #[test]
     fn what_stops_a_program_is_told() {
-        let told = |unit: Option<&str>, pid| {
+        let by = |program, unit: Option<&str>, pid| {
             let (link, device) = ("/tmp/klipper_host_mcu".into(), "/dev/pts/3".into());
-            Served { link, device, program: "Pinion", pid, unit: unit.map(str::to_owned) }.to_string()
+            Served { link, device, program, pid, unit: unit.map(str::to_owned) }.to_string()
         };
+        let told = |unit, pid| by(Some("Pinion"), unit, pid);
         let begins = "/tmp/klipper_host_mcu leads to /dev/pts/3, which Pinion serves";
         let by_unit = format!("{begins} (process 7): stop it (sudo systemctl stop pinion-mcu)");
         assert_eq!(told(Some("pinion-mcu"), Some(7)), by_unit);
         assert_eq!(told(None, Some(7)), format!("{begins} (process 7): stop it (sudo kill 7)"));
         assert_eq!(told(None, None), format!("{begins}: stop it (sudo pinion doctor may name it)"));
+        // The link is another user's, and the terminal is of root's login.
+        for unit in [Some("ssh"), None] {
+            let told = by(None, unit, Some(7));
+            assert!(
+                !told.contains("sudo") && told.ends_with("remove the link, unless that program has made it"),
+                "{told}"
+            );
+        }
     }
 }

@@ -9,7 +9,9 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
 use nix::sys::signal::Signal::{SIGTSTP, SIGTTIN, SIGTTOU};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
+use signal_hook::consts::{
+    SIGALRM, SIGHUP, SIGINT, SIGPROF, SIGQUIT, SIGTERM, SIGUSR1, SIGUSR2, SIGVTALRM, SIGXCPU, SIGXFSZ,
+};
 use signal_hook::iterator::backend::SignalDelivery;
 use signal_hook::iterator::exfiltrator::SignalOnly;
 
@@ -43,7 +45,7 @@ impl Signals {
         // SIGHUP comes when a terminal closes, and ends the program in order. (It kills the C program, which leaves its
         // pins as they are.)
         known.extend(hang_up()?);
-        if std::env::var_os("PINION_TEST_HANG").is_some() {
+        if lets_hang() {
             known.push(SIGUSR2);
         }
         SignalDelivery::with_pipe(read, write, SignalOnly, known).map(Signals)
@@ -63,6 +65,17 @@ impl Signals {
             _ => Signal::End,
         })
     }
+}
+
+/// Whether SIGUSR2 lets the core hang, for a test.
+fn lets_hang() -> bool {
+    std::env::var_os("PINION_TEST_HANG").is_some()
+}
+
+/// The signals that end the program at once, but for crashes. systemd sends SIGQUIT to a program that hangs.
+pub(super) fn deadly() -> Vec<i32> {
+    let usr2 = (!lets_hang()).then_some(SIGUSR2);
+    [SIGQUIT, SIGALRM, SIGVTALRM, SIGPROF, SIGXCPU, SIGXFSZ].into_iter().chain(usr2).collect()
 }
 
 /// SIGHUP, unless the program was started with it ignored, as by nohup(1). Registering an ignored SIGHUP would let it

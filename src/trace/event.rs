@@ -41,8 +41,8 @@ pub enum Event {
     Block(u32),
     /// The core ran this command. `more`: the number of commands that followed it at once.
     Command {
-        /// Its id in the dictionary.
-        id: u16,
+        /// Its id in the dictionary. It may be negative.
+        id: i16,
         /// Commands of the same block behind it.
         more: u8,
     },
@@ -81,8 +81,8 @@ pub enum Event {
     Nak,
     /// The link answered a block with this command by itself.
     Answered {
-        /// Its id in the dictionary.
-        id: u16,
+        /// Its id in the dictionary. It may be negative.
+        id: i16,
     },
     /// The core has no room for the host's blocks.
     Full,
@@ -187,7 +187,7 @@ impl Event {
             Event::Late { oid, late } => (3, pair(late.0, number(oid))),
             Event::Pace { worst } => (4, worst.0.into()),
             Event::Block(number) => (5, number.into()),
-            Event::Command { id, more } => (6, pair(id.into(), more.into())),
+            Event::Command { id, more } => (6, pair(id.cast_unsigned().into(), more.into())),
             Event::Held => (7, 0),
             Event::Released => (8, 0),
             Event::Configured => (9, 0),
@@ -204,7 +204,7 @@ impl Event {
             Event::Refused(Refusal::Repeated) => (24, 2),
             Event::Full => (25, 0),
             Event::Nak => (26, 0),
-            Event::Answered { id } => (27, id.into()),
+            Event::Answered { id } => (27, id.cast_unsigned().into()),
             Event::Alive => (28, 0),
             Event::ErrandBegan { oid, waited } => (30, pair(waited.0, number(oid))),
             Event::ErrandEnded { oid, took } => (31, pair(took.0, number(oid))),
@@ -230,7 +230,7 @@ impl Event {
             3 => Event::Late { oid: u8::try_from(high).ok(), late: Ticks(low) },
             4 => Event::Pace { worst: Ticks(low) },
             5 => Event::Block(low),
-            6 => Event::Command { id: low as u16, more: high as u8 },
+            6 => Event::Command { id: low as i16, more: high as u8 },
             7 => Event::Held,
             8 => Event::Released,
             9 => Event::Configured,
@@ -250,7 +250,7 @@ impl Event {
             }),
             25 => Event::Full,
             26 => Event::Nak,
-            27 => Event::Answered { id: low as u16 },
+            27 => Event::Answered { id: low as i16 },
             28 => Event::Alive,
             30 => Event::ErrandBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
             31 => Event::ErrandEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },

@@ -58,7 +58,7 @@ pub enum End {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Names {
     /// The commands of the host's dialect by their ids.
-    pub commands: BTreeMap<u16, String>,
+    pub commands: BTreeMap<i16, String>,
     /// The objects of the MCU by their oids, such as `stepper oid 3`.
     pub objects: BTreeMap<u8, String>,
     /// The lines by their numbers on the wire.

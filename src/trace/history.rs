@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::Refusal;
@@ -20,6 +20,8 @@ pub(super) struct History<'a> {
     head: &'a Head,
     /// The threads in the order of the trace. Each name comes once.
     pub lanes: Vec<Lane<'a>>,
+    /// When the last event happened, or 0. The recording goes on after a stop, as outputs change then.
+    pub last: i64,
 }
 
 /// What a thread did, in the order in which it ended.
@@ -27,6 +29,20 @@ pub(super) struct Lane<'a> {
     /// Its name. It may contain anything.
     pub thread: &'a str,
     pub deeds: Vec<Deed>,
+}
+
+/// An output whose edges are recorded.
+pub(super) struct Output {
+    pub pin: u32,
+    /// Whether the host sets its level, as that of a heater, a fan or the enable pin of a motor. The steps of a motor
+    /// are not set one by one.
+    pub is_set: bool,
+    /// Its level is unknown before this time.
+    pub known: i64,
+    /// When it was high. The last span may have no end ([`i64::MAX`]).
+    pub highs: Vec<(i64, i64)>,
+    /// Its last edge.
+    pub changed: i64,
 }
 
 /// Something that a thread did or met. Times are ticks, relative to the end of the recording.
@@ -71,11 +87,12 @@ impl<'a> History<'a> {
                 came.insert(*number, *at);
             }
         }
+        let last = threads.iter().flat_map(|(_, events)| events).map(|(at, _)| *at).max().unwrap_or(0).max(0);
         let lanes = threads.into_iter().map(|(thread, mut events)| {
             events.sort_by_key(|(at, _)| *at);
-            Lane { thread, deeds: deeds(&events, &came) }
+            Lane { thread, deeds: deeds(&events, &came, last) }
         });
-        History { head: &trace.head, lanes: lanes.collect() }
+        History { head: &trace.head, lanes: lanes.collect(), last }
     }
 
     /// All deeds with the numbers of their lanes.
@@ -86,6 +103,49 @@ impl<'a> History<'a> {
     /// The lane of the core; empty if there is none.
     pub fn core(&self) -> &[Deed] {
         self.lanes.iter().find(|lane| lane.thread == "core").map_or(&[], |lane| &lane.deeds)
+    }
+
+    /// The outputs in the order of their pins.
+    pub fn outputs(&self) -> Vec<Output> {
+        let mut all: BTreeMap<u32, Vec<(i64, bool)>> = BTreeMap::new();
+        for (_, deed) in self.deeds() {
+            if let Event::Edge { pin, level } = deed.event {
+                all.entry(pin).or_default().push((deed.to, level));
+            }
+        }
+        let begin = all.values().flatten().map(|(at, _)| *at).min().unwrap_or(0);
+        // The first edge of a line is its first level. It comes before the MCU is configured. Any other edge is a change.
+        let configured = |deed: &&Deed| matches!(deed.event, Event::Configured | Event::Reset);
+        let configured = self.core().iter().rfind(configured).map_or(i64::MIN, |deed| deed.to);
+        let outputs = all.into_iter().map(|(pin, mut edges)| {
+            edges.sort_by_key(|(at, _)| *at);
+            let (first, level) = edges[0];
+            let known = if first > configured { begin.max(configured) } else { first };
+            if known < first {
+                edges.insert(0, (known, !level));
+            }
+            let ends = edges.iter().skip(1).map(|(at, _)| *at).chain([i64::MAX]);
+            let highs = edges.iter().zip(ends).filter(|((_, level), _)| *level);
+            Output {
+                pin,
+                is_set: self.is_set(pin),
+                known,
+                highs: highs.map(|((at, _), end)| (*at, end.max(*at))).collect(),
+                changed: edges.last().map_or(first, |(at, _)| *at),
+            }
+        });
+        outputs.collect()
+    }
+
+    /// Whether a pin belongs to a digital output of the host.
+    fn is_set(&self, pin: u32) -> bool {
+        let Some(name) = self.head.names.pins.get(&pin) else { return false };
+        let of_pin = format!(" ({name})");
+        self.head
+            .names
+            .objects
+            .values()
+            .any(|object| object.starts_with("digital output ") && object.ends_with(&of_pin))
     }
 
     /// When the MCU stopped for the last time.
@@ -108,13 +168,13 @@ impl<'a> History<'a> {
     }
 
     /// The name of a command, for one line.
-    pub fn command(&self, id: u16) -> String {
+    pub fn command(&self, id: i16) -> String {
         named(self.head.names.commands.get(&id), "command", id.into())
     }
 
     /// The name of a pin, for one line.
     pub fn pin(&self, pin: u32) -> String {
-        named(self.head.names.pins.get(&pin), "pin", pin)
+        named(self.head.names.pins.get(&pin), "pin", pin.into())
     }
 
     /// What ended the recording, in one line.
@@ -209,11 +269,11 @@ pub(super) fn short(name: &str) -> String {
     cut(name, NAME_MAX)
 }
 
-fn cut(text: &str, letters: usize) -> String {
+pub(super) fn cut(text: &str, letters: usize) -> String {
     plain(text).chars().take(letters).collect()
 }
 
-fn named(name: Option<&String>, kind: &str, number: u32) -> String {
+fn named(name: Option<&String>, kind: &str, number: i64) -> String {
     name.filter(|name| !name.is_empty()).map_or_else(|| format!("{kind} {number}"), |name| short(name))
 }
 
@@ -231,9 +291,9 @@ pub(super) fn at_ms(at: i64) -> String {
     format!("{:.2}", (ms * 100.0).round() / 100.0 + 0.0)
 }
 
-/// The deeds that these events of a thread tell of. `came`: when each block came.
-fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>) -> Vec<Deed> {
-    let end = events.last().map_or(0, |(at, _)| (*at).max(0));
+/// The deeds that these events of a thread tell of. `came`: when each block came. `end`: when the last event of all
+/// threads happened.
+fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Deed> {
     let mut deeds = Vec::with_capacity(events.len());
     let mut held = None;
     let mut errand: Option<Deed> = None;
@@ -340,6 +400,35 @@ pub(super) mod tests {
         trace
     }
 
+    /// A print that stops at 0, after 1 s. 18 motors step; the first ones step last. A heater has PWM pulses, and the fan
+    /// is on for so long that the recording has forgotten its edge. The outputs change 20 to 78 us after it.
+    pub(in crate::trace) fn stopped_print() -> Trace {
+        const STOP: u64 = 1_000_000;
+        let edge = |at: u64, pin: u32, level: bool| (at, Event::Edge { pin, level });
+        let mut edges = Vec::new();
+        for pin in 0..18 {
+            let at = STOP - 100 * (18 + u64::from(pin));
+            edges.extend([edge(at, pin, true), edge(at + 2, pin, false)]);
+        }
+        for pulse in (10_000..STOP).step_by(50_000) {
+            edges.extend([edge(pulse, 19, true), edge(pulse + 20_000, 19, false)]);
+        }
+        edges.extend([edge(STOP + 20, 20, false), edge(STOP + 78, 18, true)]);
+        edges.sort_by_key(|(at, _)| *at);
+        let core = [(5, Event::Configured), (STOP, Event::Stopped { block: 3 })];
+        let sampler = [(STOP + 20_000, Event::Looked { again: Ticks::from_ms(500), all: true })];
+        let reason = End::Shutdown { reason: "Command request".into(), trouble: "the host stopped the MCU".into() };
+        let mut trace = trace(reason, &[("core", &core), ("edges", &edges), ("sampler", &sampler)]);
+        trace.head.ended_at = Clock::from_ticks(STOP * 50).to_bits();
+        let names = &mut trace.head.names;
+        names.pins = (0..18).map(|pin| (pin, format!("step{pin}"))).collect();
+        for (oid, name) in [(18, "x_enable"), (19, "heater"), (20, "fan")] {
+            names.pins.insert(oid.into(), name.to_owned());
+            names.objects.insert(oid, format!("digital output oid {oid} ({name})"));
+        }
+        trace
+    }
+
     /// What an export writes.
     pub(in crate::trace) fn text(write: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> String {
         let mut text = Vec::new();
@@ -412,6 +501,24 @@ pub(super) mod tests {
                 deed(-180, -175, ended, 7),
                 deed(-170, -140, began, 7),
                 deed(-140, 0, began, 7),
+            ]
+        );
+    }
+
+    #[test]
+    fn an_output_has_its_level_before_its_first_change_but_not_before_it_was_configured() {
+        let edge = |pin, level| Event::Edge { pin, level };
+        let edges = [(10, edge(1, false)), (20, edge(2, true)), (60, edge(1, true)), (70, edge(3, false))];
+        let core = [(50, Event::Configured), (100, Event::Stopped { block: 1 })];
+        let trace = trace(End::Died, &[("core", &core), ("edges", &edges)]);
+        let outputs = History::of(&trace).outputs();
+        let found = outputs.iter().map(|output| (output.pin, output.known / 50, output.highs.clone()));
+        assert_eq!(
+            found.collect::<Vec<_>>(),
+            [
+                (1, -90, vec![(-40 * 50, i64::MAX)]),
+                (2, -80, vec![(-80 * 50, i64::MAX)]),
+                (3, -50, vec![(-50 * 50, -30 * 50)]),
             ]
         );
     }

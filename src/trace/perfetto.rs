@@ -227,7 +227,7 @@ mod tests {
         let items: Vec<Read> = serde_json::from_value(file["traceEvents"].take()).unwrap();
         let mut free: HashMap<u32, f64> = HashMap::new();
         let mut open = HashMap::new();
-        let mut last: HashMap<(u32, &str), f64> = HashMap::new();
+        let mut last: HashMap<(u32, &str, &str), f64> = HashMap::new();
         let mut named = HashSet::new();
         for item in &items {
             assert!(item.ts >= 0.0 && !item.cat.is_empty() && !item.name.is_empty());
@@ -235,8 +235,8 @@ mod tests {
             assert!(item.ph == "M" || named.contains(&item.tid), "track {} has no name", item.tid);
             // Items of one kind come in the order of their times on each track. Counters are tracks by their names. A
             // late timer's value lasts a microsecond.
-            let counter = if item.ph == "C" { item.name.as_str() } else { item.ph.as_str() };
-            let before = last.insert((item.tid, counter), item.ts).unwrap_or(0.0);
+            let counter = if item.ph == "C" { item.name.as_str() } else { "" };
+            let before = last.insert((item.tid, item.ph.as_str(), counter), item.ts).unwrap_or(0.0);
             assert!(
                 ["b", "e", "M"].contains(&&*item.ph) || item.ts * (1.0 + 1e-9) + 1.01 >= before,
                 "{} goes back",

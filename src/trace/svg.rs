@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A picture of a trace's end: what each thread did in the last 200 ms.
+//! A picture of a trace's end: what each thread did in the last 200 ms, and the verdict.
 
 #![forbid(unsafe_code)]
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::fmt::{Arguments, Write as _};
 use std::io::{self, Write};
@@ -11,7 +12,8 @@ use pinion_firmware::time::Ticks;
 
 use super::event::Event;
 use super::file::{End, Trace};
-use super::history::{Deed, History, TICKS_PER_MS, ms, short};
+use super::history::{Deed, History, Output, TICKS_PER_MS, cut, ms, short};
+use super::verdict::verdict;
 use crate::foreign::plain_xml;
 
 /// The span of the picture.
@@ -23,7 +25,11 @@ const MARK_MS: i64 = 20;
 const WIDTH: f64 = 1000.0;
 const LEFT: f64 = 150.0;
 const RIGHT: f64 = 24.0;
-const TOP: f64 = 92.0;
+/// Height of the title and the facts, and of a line of the verdict.
+const HEAD: f64 = 52.0;
+const LINE: f64 = 17.0;
+/// Height of the labels of the red lines.
+const LABELS: f64 = 46.0;
 /// Heights of a row, of its bars, and of the diagram of lateness.
 const ROW: f64 = 26.0;
 const BAR: f64 = 16.0;
@@ -31,22 +37,28 @@ const LATENESS: f64 = 130.0;
 const BOTTOM: f64 = 74.0;
 /// Letters of a row's name that have room.
 const NAME_MAX: usize = 20;
-/// Highest number of rows of buses, and of outputs.
-const ROWS_MAX: usize = 12;
+/// Highest number of letters of the verdict, and of one of its lines.
+const VERDICT_MAX: usize = 600;
+const VERDICT_LINE_MAX: usize = 140;
+/// Highest number of rows of buses, of outputs, and of outputs that the host sets.
+const BUSES_MAX: usize = 12;
+const OUTPUTS_MAX: usize = 16;
+const SET_MAX: usize = 10;
 /// The range of the lateness, in powers of ten of a µs: 1 µs to 100 ms.
 const DECADES: i32 = 5;
 
 /// Colors that are visible on white and on black.
 const HOST: &str = "#1a8fe3";
 const COMMANDS: &str = "#b04fc4";
-const STEPS: &str = "#2f9e44";
+const SET: &str = "#e8720c";
+const OTHER: &str = "#2f9e44";
 const BUS: &str = "#c49a00";
 const CORE: &str = "#6e8aa6";
 const LATE: &str = "#e0457b";
 const STOP: &str = "#e5372c";
 
-/// Writes the picture as an SVG document: the last 200 ms before the MCU stopped, or before the end of the recording. It
-/// is readable on light and on dark backgrounds and needs no other file.
+/// Writes the picture as an SVG document: 200 ms until 10 ms after the MCU stopped, or until the end of the recording.
+/// It is readable on light and on dark backgrounds and needs no other file.
 ///
 /// # Errors
 ///
@@ -54,24 +66,26 @@ const STOP: &str = "#e5372c";
 pub fn write(trace: &Trace, out: &mut impl Write) -> io::Result<()> {
     let history = History::of(trace);
     let stopped = history.stopped().filter(|_| matches!(trace.head.end, End::Shutdown { .. }));
-    let end = stopped.map_or(0, |at| at.saturating_add(AFTER_STOP)).min(0);
+    let end = stopped.map_or(0, |at| at.saturating_add(AFTER_STOP).min(history.last));
     let window = Window { from: end.saturating_sub(SPAN), to: end };
     let rows = rows(&history, &window);
-    let lateness_at = TOP + ROW * rows.len() as f64 + 34.0;
+    let verdict = wrapped(&cut(&format!("verdict: {}", verdict(trace).text), VERDICT_MAX), VERDICT_LINE_MAX);
+    let top = HEAD + LINE * verdict.len() as f64 + LABELS;
+    let lateness_at = top + ROW * rows.len() as f64 + 34.0;
     let bottom = lateness_at + LATENESS;
     let mut svg = Svg { text: String::new(), window };
-    svg.begin(bottom + BOTTOM, &history, trace);
-    svg.times(bottom);
+    svg.begin(bottom + BOTTOM, &history, trace, &verdict);
+    svg.times(top, bottom, if history.stopped() == Some(0) { "the stop" } else { "the end of the recording" });
     for (index, row) in rows.iter().enumerate() {
-        svg.row(row, TOP + ROW * index as f64);
+        svg.row(row, top + ROW * index as f64);
     }
     svg.lateness(&history, lateness_at);
     if let Some(stopped) = history.stopped() {
-        svg.marker(stopped, "stopped", "8 4", 70.0, bottom);
+        svg.marker(stopped, "stopped", "8 4", top - 22.0, bottom);
         if let Some(due) = history.due() {
             let early = if due <= stopped { "before" } else { "after" };
             let label = format!("due {} ms {early} the stop", ms(due.abs_diff(stopped)));
-            svg.marker(due, &label, "2 3", 84.0, bottom);
+            svg.marker(due, &label, "2 3", top - 8.0, bottom);
         }
     }
     svg.legend(bottom + 58.0);
@@ -137,31 +151,51 @@ fn rows(history: &History<'_>, window: &Window) -> Vec<Row> {
         row("commands", COMMANDS, of(core, |event| matches!(event, Event::Command { .. })), true),
         row("wait for a bus", COMMANDS, of(core, |event| matches!(event, Event::Held | Event::Released)), false),
     ];
-    // The level of each output: high from its edge to the next one.
-    let mut outputs: BTreeMap<u32, Vec<(i64, i64)>> = BTreeMap::new();
-    let mut edges: Vec<&Deed> = all.iter().filter(|deed| matches!(deed.event, Event::Edge { .. })).collect();
-    edges.sort_by_key(|deed| deed.to);
-    for deed in edges {
-        if let Event::Edge { pin, level } = deed.event {
-            let highs = outputs.entry(pin).or_default();
-            if let Some((_, to @ i64::MAX)) = highs.last_mut() {
-                *to = deed.to;
-            }
-            if level {
-                highs.push((deed.to, i64::MAX));
-            }
-        }
+    let (outputs, left_out) = shown(history.outputs(), window);
+    rows.extend(outputs.into_iter().map(|output| {
+        let color = if output.is_set { SET } else { OTHER };
+        row(&history.pin(output.pin), color, output.highs, false)
+    }));
+    if left_out > 0 {
+        rows.push(row(&format!("(and {left_out} outputs)"), OTHER, Vec::new(), false));
     }
-    let outputs = outputs.into_iter().take(ROWS_MAX);
-    rows.extend(outputs.map(|(pin, highs)| row(&history.pin(pin), STEPS, highs, false)));
     let busy = |event: &Event| matches!(event, Event::ErrandBegan { .. } | Event::ErrandEnded { .. });
     let buses = history.lanes.iter().filter(|lane| lane.deeds.iter().any(|deed| busy(&deed.event)));
-    rows.extend(buses.take(ROWS_MAX).map(|lane| row(&short(lane.thread), BUS, of(&lane.deeds, busy), false)));
+    rows.extend(buses.take(BUSES_MAX).map(|lane| row(&short(lane.thread), BUS, of(&lane.deeds, busy), false)));
     let sleeps: Vec<(i64, i64)> = of(core, |event| matches!(event, Event::Woke { .. }));
-    let ends = sleeps.iter().skip(1).map(|(from, _)| *from).chain([window.to]);
+    let ends = sleeps.iter().skip(1).map(|(from, _)| *from).chain(core.last().map(|deed| deed.to));
     let awake = sleeps.iter().zip(ends).map(|((_, woke), sleeps)| (*woke, sleeps.max(*woke))).collect();
     rows.push(row("core is awake", CORE, awake, false));
     rows
+}
+
+/// The outputs that have rows, and the number of the others. Those that the host sets come first: what is high may be
+/// hot. Then come those that changed last.
+fn shown(mut outputs: Vec<Output>, window: &Window) -> (Vec<Output>, usize) {
+    let is_high = |output: &Output| output.highs.iter().any(|(from, to)| *to >= window.from && *from <= window.to);
+    outputs.sort_by_cached_key(|output| Reverse((output.is_set, output.is_set && is_high(output), output.changed)));
+    let set = outputs.iter().filter(|output| output.is_set).count().min(SET_MAX);
+    outputs[set..].sort_by_key(|output| Reverse(output.changed));
+    let left_out = outputs.len().saturating_sub(OUTPUTS_MAX);
+    outputs.truncate(OUTPUTS_MAX);
+    outputs.sort_by_key(|output| (!output.is_set, output.pin));
+    (outputs, left_out)
+}
+
+/// The text in lines of at most this many letters, broken at spaces if there are some.
+fn wrapped(text: &str, letters: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        let mut word: Vec<char> = word.chars().collect();
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.len() <= letters => {
+                line.push(' ');
+                line.extend(word);
+            }
+            _ => lines.extend(word.chunks_mut(letters).map(|part| part.iter().collect::<String>())),
+        }
+    }
+    lines
 }
 
 struct Svg {
@@ -175,7 +209,7 @@ impl Svg {
         let _ = writeln!(self.text, "{element}");
     }
 
-    fn begin(&mut self, height: f64, history: &History<'_>, trace: &Trace) {
+    fn begin(&mut self, height: f64, history: &History<'_>, trace: &Trace, verdict: &[String]) {
         let title = plain_xml(&history.end());
         let facts = plain_xml(&format!("{}, {}", short(&trace.head.version), short(&trace.head.link)));
         self.put(format_args!(
@@ -186,6 +220,9 @@ impl Svg {
              <rect class=\"paper\" width=\"{WIDTH}\" height=\"{height}\"/>\n\
              <text x=\"24\" y=\"28\" font-size=\"16\">{title}</text>\n<text x=\"24\" y=\"48\">{facts}</text>"
         ));
+        for (number, line) in (1u8..).zip(verdict) {
+            self.text(24.0, 48.0 + LINE * f64::from(number), "start", line);
+        }
     }
 
     fn text(&mut self, x: f64, y: f64, anchor: &str, text: &str) {
@@ -196,19 +233,20 @@ impl Svg {
         self.put(format_args!("<line x1=\"{x:.1}\" y1=\"{from:.1}\" x2=\"{x:.1}\" y2=\"{to:.1}\" {style}/>"));
     }
 
-    fn times(&mut self, bottom: f64) {
+    fn times(&mut self, top: f64, bottom: f64, zero: &str) {
         let Window { from, to } = self.window;
-        // The marks are at round times before the end of the recording.
+        // The marks are at round times.
         let mark = MARK_MS * TICKS_PER_MS;
         let mut at = to.saturating_sub(to.rem_euclid(mark));
         while at >= from {
             let x = self.window.x(at);
-            self.line(x, TOP - 4.0, bottom, format_args!("class=\"grid\""));
+            self.line(x, top - 4.0, bottom, format_args!("class=\"grid\""));
             self.text(x, bottom + 17.0, "middle", &(at / TICKS_PER_MS).to_string());
             let Some(before) = at.checked_sub(mark) else { break };
             at = before;
         }
-        self.text((LEFT + WIDTH - RIGHT) / 2.0, bottom + 34.0, "middle", "time, ms (0 is the end of the recording)");
+        let label = format!("time, ms (0 is {zero})");
+        self.text((LEFT + WIDTH - RIGHT) / 2.0, bottom + 34.0, "middle", &label);
     }
 
     fn row(&mut self, row: &Row, top: f64) {
@@ -279,13 +317,14 @@ impl Svg {
         let entries = [
             (HOST, "from the host"),
             (COMMANDS, "commands"),
-            (STEPS, "output is high"),
+            (SET, "set output is high"),
+            (OTHER, "other output is high"),
             (BUS, "bus is busy"),
             (CORE, "core"),
             (LATE, "late timer"),
-            (STOP, "stop, and the time it was about"),
+            (STOP, "stop, due time"),
         ];
-        let mut x = LEFT;
+        let mut x = 24.0;
         for (color, text) in entries {
             self.put(format_args!(
                 "<rect x=\"{x:.1}\" y=\"{:.1}\" width=\"12\" height=\"10\" fill=\"{color}\"/>",
@@ -300,7 +339,7 @@ impl Svg {
 
 #[cfg(test)]
 mod tests {
-    use super::super::history::tests::{any_trace, late_host, text};
+    use super::super::history::tests::{any_trace, late_host, stopped_print, text};
     use super::*;
     use proptest::prelude::*;
 
@@ -322,6 +361,46 @@ mod tests {
         assert_eq!(busy.len(), 6);
         assert_eq!(busy[4], (488.7, 49.6));
         assert_eq!(busy[5], (934.7, 41.3));
+    }
+
+    #[test]
+    fn it_shows_what_is_hot_what_changed_last_and_what_the_stop_did() {
+        let svg = text(|out| write(&stopped_print(), out));
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        let texts: Vec<&str> = document.descendants().filter_map(|node| node.text()).collect();
+        let shown = |name: &str| texts.contains(&name);
+        assert!(
+            ["x_enable", "heater", "fan", "step0", "step12", "(and 5 outputs)"].into_iter().all(shown),
+            "{texts:?}"
+        );
+        assert!(!shown("step13"), "{texts:?}");
+        assert!(shown("time, ms (0 is the stop)"));
+        let number = |node: &roxmltree::Node, name: &str| node.attribute(name).unwrap().parse::<f64>().unwrap();
+        let high: Vec<(f64, f64)> = document
+            .descendants()
+            .filter(|node| node.attribute("fill") == Some(SET) && node.attribute("width") != Some("12"))
+            .map(|node| (number(&node, "x"), (number(&node, "x") + number(&node, "width")).round()))
+            .collect();
+        // From -190 to 10 ms. The motor's enable pin is high after the stop, and the fan is on before it.
+        assert_eq!(high.first(), Some(&(935.0, 976.0)));
+        assert_eq!(high.last(), Some(&(150.0, 935.0)));
+        assert_eq!(high.len(), 6);
+    }
+
+    #[test]
+    fn the_verdict_is_in_lines_that_fit() {
+        let mut trace = stopped_print();
+        let trouble = "the host stopped the MCU because ".to_owned() + &"of its own reason ".repeat(15);
+        trace.head.end = End::Shutdown { reason: "Command request".into(), trouble };
+        let svg = text(|out| write(&trace, out));
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        let texts: Vec<&str> =
+            document.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect();
+        let lines: Vec<&str> = texts.iter().copied().filter(|text| text.contains("of its own")).collect();
+        assert!(lines.len() > 1 && lines.iter().all(|line| line.chars().count() <= VERDICT_LINE_MAX), "{lines:?}");
+        assert!(lines.join(" ").starts_with(&format!("verdict: {}", verdict(&trace).text.trim())), "{lines:?}");
+        assert_eq!(wrapped(&"x".repeat(5), 2), ["xx", "xx", "x"]);
+        assert_eq!(wrapped("a bb ccc", 4), ["a bb", "ccc"]);
     }
 
     proptest! {

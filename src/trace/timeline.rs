@@ -162,7 +162,7 @@ struct Fold {
     /// By the order of their kinds in the line.
     kinds: BTreeMap<Kind, Sum>,
     /// How often each command came, and how many came right behind those.
-    commands: BTreeMap<u16, u64>,
+    commands: BTreeMap<i16, u64>,
     behind: u64,
 }
 
@@ -276,7 +276,7 @@ impl Fold {
 
     fn commands(&self, history: &History<'_>) -> Option<String> {
         let all = self.commands.values().sum::<u64>() + self.behind;
-        let mut commands: Vec<(&u16, &u64)> = self.commands.iter().collect();
+        let mut commands: Vec<(&i16, &u64)> = self.commands.iter().collect();
         commands.sort_by_key(|(_, count)| Reverse(**count));
         let named = commands.iter().take(COMMANDS_MAX);
         let mut names: Vec<String> = named.map(|(id, count)| format!("{} {count}", history.command(**id))).collect();

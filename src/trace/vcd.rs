@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
 
 use pinion_firmware::time::Ticks;
@@ -15,6 +15,8 @@ use super::history::{Deed, History, short};
 /// The signals begin this long before the end of the recording, or with it. PulseView makes a sample of each unit of
 /// time, even if nothing changes.
 const SPAN: i64 = Ticks::from_ms(10_000).0 as i64;
+/// Longest part after the end of the recording. What a stop does takes some ms.
+const AFTER_MAX: i64 = Ticks::from_ms(1_000).0 as i64;
 /// Ticks in a unit of time.
 const UNIT: i64 = Ticks::from_us(1).0 as i64;
 /// The same with edges of outputs. Their pulses may be shorter than 1 µs.
@@ -22,7 +24,7 @@ const UNIT_OF_EDGES: i64 = UNIT / 10;
 /// Highest number of outputs.
 const OUTPUTS_MAX: usize = 64;
 
-/// Writes the signals of the last ten seconds.
+/// Writes the signals of the last ten seconds, and of what a stop did.
 ///
 /// - `core_awake`: the core does not sleep
 /// - `core_held`: commands wait for a bus
@@ -40,7 +42,11 @@ pub fn write(trace: &Trace, out: &mut impl Write) -> io::Result<()> {
     let history = History::of(trace);
     let first = history.deeds().map(|(_, deed)| deed.from).min().unwrap_or(0);
     let edges = history.deeds().any(|(_, deed)| matches!(deed.event, Event::Edge { .. }));
-    let scale = Scale { start: first.clamp(-SPAN, 0), unit: if edges { UNIT_OF_EDGES } else { UNIT } };
+    let scale = Scale {
+        start: first.clamp(-SPAN, 0),
+        end: history.last.min(AFTER_MAX),
+        unit: if edges { UNIT_OF_EDGES } else { UNIT },
+    };
     let signals = signals(&history);
     writeln!(out, "$comment {} $end", word(&trace.head.version))?;
     writeln!(out, "$timescale {} $end", if edges { "100 ns" } else { "1 us" })?;
@@ -94,6 +100,8 @@ pub fn write(trace: &Trace, out: &mut impl Write) -> io::Result<()> {
 struct Scale {
     /// The time of its zero, in ticks relative to the end of the recording.
     start: i64,
+    /// The time of its last unit.
+    end: i64,
     /// Ticks in a unit.
     unit: i64,
 }
@@ -103,9 +111,8 @@ impl Scale {
         at.saturating_sub(self.start).div_euclid(self.unit)
     }
 
-    /// The end of the recording.
     fn last(self) -> i64 {
-        self.at(0)
+        self.at(self.end)
     }
 }
 
@@ -115,7 +122,7 @@ struct Signal {
     real: bool,
     /// Its value is unknown before this time.
     known: i64,
-    /// Spans with the value. They may overlap: the highest value counts.
+    /// Spans with the value. They may overlap: the highest value counts. One that nothing ends has no end in the file.
     spans: Vec<(i64, i64, u32)>,
 }
 
@@ -142,7 +149,7 @@ impl Signal {
         turns.sort_unstable();
         let mut active: BTreeMap<u32, usize> = BTreeMap::new();
         let mut changes = vec![(0, (known == 0).then_some(0))];
-        if known > 0 && self.known <= 0 {
+        if known > 0 && self.known <= scale.end {
             changes.push((known, Some(0)));
         }
         let mut turns = turns.into_iter().peekable();
@@ -175,7 +182,8 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
     let all: Vec<Deed> = history.deeds().map(|(_, deed)| *deed).collect();
     let first = |deeds: &[Deed]| deeds.iter().map(|deed| deed.from).min().unwrap_or(0);
     let when = |deeds: &[Deed], is: fn(&Event) -> bool| -> Vec<(i64, i64, u32)> {
-        deeds.iter().filter(|deed| is(&deed.event)).map(|deed| (deed.from, deed.to, 1)).collect()
+        let to = |deed: &Deed| if deed.is_open() { i64::MAX } else { deed.to };
+        deeds.iter().filter(|deed| is(&deed.event)).map(|deed| (deed.from, to(deed), 1)).collect()
     };
     let pulses = |is: fn(&Event) -> bool| -> Vec<(i64, i64, u32)> {
         all.iter().filter(|deed| is(&deed.event)).map(|deed| (deed.to, deed.to, 1)).collect()
@@ -215,28 +223,18 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
             signals.push(Signal::new(&format!("busy_{}", short(lane.thread)), first(&lane.deeds), busy));
         }
     }
-    let mut outputs: HashMap<u32, Vec<Deed>> = HashMap::new();
-    for deed in &all {
-        if let Event::Edge { pin, .. } = deed.event {
-            outputs.entry(pin).or_default().push(*deed);
-        }
-    }
-    let mut outputs: Vec<(u32, Vec<Deed>)> = outputs.into_iter().collect();
-    outputs.sort_by_key(|(pin, _)| *pin);
-    signals.extend(outputs.into_iter().take(OUTPUTS_MAX).map(|(pin, edges)| {
-        levels(&history.pin(pin), i64::MAX, &edges, |event| match event {
-            Event::Edge { level, .. } => Some(*level),
-            _ => None,
-        })
+    signals.extend(history.outputs().into_iter().take(OUTPUTS_MAX).map(|output| {
+        let highs = output.highs.into_iter().map(|(from, to)| (from, to, 1)).collect();
+        Signal::new(&history.pin(output.pin), output.known, highs)
     }));
     signals
 }
 
-/// The core is awake between its sleeps.
+/// The core is awake between its sleeps. Nothing tells of its next sleep, so the last time is that of its last event.
 fn awake(core: &[Deed]) -> Signal {
     let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();
     let known = sleeps.first().map_or(i64::MAX, |deed| deed.from);
-    let ends = sleeps.iter().skip(1).map(|next| next.from).chain([0]);
+    let ends = sleeps.iter().skip(1).map(|next| next.from).chain(core.last().map(|deed| deed.to));
     let spans = sleeps.iter().zip(ends).map(|(sleep, end)| (sleep.to, end.max(sleep.to), 1)).collect();
     Signal::new("core_awake", known, spans)
 }
@@ -245,7 +243,7 @@ fn awake(core: &[Deed]) -> Signal {
 fn levels(name: &str, known: i64, deeds: &[Deed], level: fn(&Event) -> Option<bool>) -> Signal {
     let levels: Vec<(i64, bool)> =
         deeds.iter().filter_map(|deed| level(&deed.event).map(|level| (deed.to, level))).collect();
-    let ends = levels.iter().skip(1).map(|(at, _)| *at).chain([0]);
+    let ends = levels.iter().skip(1).map(|(at, _)| *at).chain([i64::MAX]);
     let spans = levels.iter().zip(ends).filter(|((_, level), _)| *level);
     let spans = spans.map(|((at, _), end)| (*at, end.max(*at), 1)).collect();
     Signal::new(name, levels.first().map_or(known, |(first, _)| known.min(*first)), spans)
@@ -264,9 +262,10 @@ fn identifier(number: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::history::tests::{any_trace, late_host, text};
+    use super::super::history::tests::{any_trace, late_host, stopped_print, text};
     use super::*;
     use proptest::prelude::*;
+    use std::collections::HashMap;
     use std::process::Command;
 
     /// What sigrok reads: the changes of each wire by its name, with their times in units of 100 ns.
@@ -311,7 +310,7 @@ mod tests {
             ("busy_spi0", 91, 2000, 2400),
             ("timer_late", 2, 910_000 - 310, 910_000),
             ("gpio17", 2 * 93 * 8, 6000, 6002),
-            ("core_awake", 2 * 1994 - 1, 500, 550),
+            ("core_awake", 2 * 1994, 500, 550),
             ("host_block", 2 * 94, 5000, 5000),
             ("command", 4 * 94, 5070, 5070),
         ] {
@@ -321,6 +320,32 @@ mod tests {
             assert_eq!(changes.len(), transitions, "{signal}");
         }
         assert_eq!(signals["mcu_stopped"], [(0, '0'), (at(995_100), '1')]);
+    }
+
+    #[test]
+    fn the_signals_go_on_after_the_stop() {
+        let text = text(|out| write(&stopped_print(), out));
+        // The file begins with the first event, at 5 us. The first edge is at 10 ms.
+        let stop = 10 * (1_000_000 - 5);
+        let changes = |name: &str| {
+            let (before, _) = text.split_once(&format!(" {name} $end")).unwrap();
+            let (_, id) = before.rsplit_once(' ').unwrap();
+            let mut at = 0u64;
+            let mut changes = Vec::new();
+            for line in text.lines() {
+                match line.strip_prefix('#') {
+                    Some(now) => at = now.parse().unwrap(),
+                    None if line.get(1..) == Some(id) => changes.push((at, &line[..1])),
+                    None => {}
+                }
+            }
+            changes
+        };
+        let edges = 10 * (10_000 - 5);
+        assert_eq!(changes("fan"), [(0, "x"), (edges, "1"), (stop + 200, "0")]);
+        assert_eq!(changes("x_enable"), [(0, "x"), (edges, "0"), (stop + 780, "1")]);
+        assert_eq!(changes("mcu_stopped"), [(0, "0"), (stop, "1")]);
+        assert!(text.ends_with(&format!("#{}\n", stop + 200_000)), "{text}");
     }
 
     #[test]
@@ -350,7 +375,7 @@ mod tests {
                 match line.split_at(1) {
                     ("#", at) => {
                         let at = at.parse::<u64>().unwrap();
-                        prop_assert!(now < Some(at) && at <= 100_000_000, "{line}");
+                        prop_assert!(now < Some(at) && at <= 110_000_000, "{line}");
                         now = Some(at);
                     }
                     ("0" | "1" | "x", id) => prop_assert_eq!(declared[id], "wire"),

@@ -139,7 +139,8 @@ impl Printer {
         let alone = HERE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut printer = Printer::serve(checkout, describe, change, |folder| {
             let clock = Monotonic::start();
-            let config = SimConfig::load(&folder.join("board.toml")).unwrap();
+            let config =
+                SimConfig::parse(&fs::read_to_string(folder.join("board.toml")).unwrap(), "board.toml").unwrap();
             let board = SimBoard::new(config, Arc::new(clock)).unwrap();
             let (probe, timing) = (board.probe(), board.timing());
             let options = Options {

@@ -135,18 +135,17 @@ fn written(sent: &[u64], register: u8) -> Option<u32> {
 fn klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once() {
     const DUMPS: usize = 100;
     let Some(checkout) = checkout("klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once") else { return };
-    let slow = |board: String, trace: &std::path::Path| {
-        let bus = format!("name = \"spidev1.0\"\ndelay_us = 4000\ntrace_file = {trace:?}\n");
-        let slow = board.replace("name = \"spidev1.0\"\n", &bus);
+    let slow = |board: String, _: &std::path::Path| {
+        let slow = board.replace("name = \"spidev1.0\"\n", "name = \"spidev1.0\"\ndelay_us = 4000\n");
         assert_ne!(slow, board, "the built-in printer's bus has another name");
         slow
     };
-    let mut printer = Printer::start_on(&checkout, slow, |config| config);
+    let mut printer = Printer::start_sim(&checkout, &["--spi-trace", "trace"], slow, |config| config);
     printer.until_state("ready");
     let sent = |printer: &Printer| -> Vec<u64> {
         let trace = printer.trace();
         // Another chip is also on this bus.
-        let driver = trace.lines().filter(|line| line.starts_with("chips=tmc5160 z "));
+        let driver = trace.lines().filter(|line| line.starts_with("bus=spidev1.0 chips=tmc5160 z "));
         let sent = driver.map(|line| line.split_once(" sent=").unwrap().1.split_once(' ').unwrap().0);
         sent.map(|sent| u64::from_str_radix(sent, 16).unwrap()).collect()
     };

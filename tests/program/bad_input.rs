@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Invalid input from a host. Each case ends in the firmware's shutdown text, and in a log line with the cause and the
-//! remedy. The process is ready for the next FIRMWARE_RESTART.
+//! Invalid input. From a host, each case ends in the firmware's shutdown text, and in a log line with the cause and the
+//! remedy. The process is ready for the next FIRMWARE_RESTART. A wrong file ends the command with one line.
 
+use std::fs::{self, File};
 use std::time::{Duration, Instant};
 
 use pinion_client::Client;
 use pinion_protocol::block::Sequence;
 
-use crate::process::{Pinion, WAIT_MAX};
+use crate::process::{Pinion, WAIT_MAX, limited};
 
 /// Sends the lines to an MCU with eight ids. It must stop for `reason` and log all of `words` in one line. Then a reset
 /// must make it ready again.
@@ -156,4 +157,48 @@ fn a_block_out_of_order_is_answered_by_a_nak() {
         }
     }
     assert_eq!(empty, 1, "one NAK");
+}
+
+#[test]
+fn a_file_of_any_kind_ends_the_command_in_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let name = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let [fifo, directory, sparse] = ["fifo.svg", "directory.svg", "sparse"].map(name);
+    nix::unistd::mkfifo(&*fifo, nix::sys::stat::Mode::S_IRWXU).unwrap();
+    fs::create_dir(&directory).unwrap();
+    File::create(&sparse).unwrap().set_len(5 << 30).unwrap();
+    let ends = |args: &[&str], cause: &str| {
+        let (code, said) = limited(args);
+        assert_eq!(code, Some(1), "{args:?}: {said}");
+        assert!(said.contains(cause), "{args:?}: {said}");
+    };
+    let irregular = "it is no regular file";
+    for (file, cause) in
+        [(&*fifo, irregular), (&*directory, irregular), ("/dev/zero", irregular), (&*sparse, "longer than")]
+    {
+        let board = &format!("sim:{file}");
+        for args in [
+            &["run", "--config", file][..],
+            &["run", "--check", "--config", file],
+            &["run", "--check", "--board", board],
+            &["dict", "--board", board],
+            &["sim", file, "--print-config"],
+            &["sim", "--compare", file],
+            &["console", "--board", "sim", "-f", file],
+        ] {
+            ends(args, cause);
+        }
+        ends(&["trace", file], if file == sparse { "it is no trace of Pinion" } else { irregular });
+    }
+    for file in [&*fifo, &*directory] {
+        for args in [
+            &["sim", "--toolpath", file][..],
+            &["sim", "--picture", file],
+            &["sim", "--spi-trace", file],
+            &["dict", "--board", "sim", "-o", file],
+            &["latency", "--seconds", "2", "--svg", file],
+        ] {
+            ends(args, irregular);
+        }
+    }
 }

@@ -38,8 +38,12 @@ fn request(address: SocketAddr, target: &str) -> TcpStream {
 }
 
 fn snapshot(address: SocketAddr) -> Vec<u8> {
+    snapshot_of(address, "/snapshot")
+}
+
+fn snapshot_of(address: SocketAddr, target: &str) -> Vec<u8> {
     let mut answer = Vec::new();
-    request(address, "/snapshot").read_to_end(&mut answer).unwrap();
+    request(address, target).read_to_end(&mut answer).unwrap();
     assert!(answer.starts_with(b"HTTP/1.1 200 OK\r\n"), "{}", String::from_utf8_lossy(&answer));
     let body = answer.windows(4).position(|four| four == b"\r\n\r\n").unwrap() + 4;
     let jpeg = answer.split_off(body);
@@ -95,13 +99,32 @@ fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
 }
 
 #[test]
+fn a_shutdown_is_in_the_picture() {
+    let (pinion, camera) = start(&["--show"]);
+    let mut client = Client::connect(&pinion.link(), WAIT_MAX).unwrap();
+    for line in MOTORS {
+        client.send_line(line).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
+    let before = snapshot(camera);
+    client.emergency_stop().unwrap();
+    pinion.until("the word", || snapshot(camera) != before);
+    // The page chooses the other layout in a narrow window.
+    assert_ne!(snapshot_of(camera, "/snapshot?layout=tall"), snapshot(camera));
+    client.reset().unwrap();
+    pinion.until("the picture of before", || snapshot(camera) == before);
+}
+
+#[test]
 fn no_thread_of_the_camera_is_in_a_hurry() {
     let (pinion, camera) = start(&["-r", "--show"]);
     let mut viewer = request(camera, "/stream");
     viewer.read_exact(&mut [0; 1000]).unwrap();
-    for thread in ["camera", "camera path", "camera pen", "camera viewer"] {
+    for thread in ["camera", "camera path", "camera pen", "camera targets", "camera viewer"] {
         assert_eq!(pinion.scheduling(thread), [(0, 10)], "{thread}: SCHED_OTHER, and nice");
     }
+    assert!(matches!(pinion.scheduling("own status")[..], [(0, _)]), "SCHED_OTHER");
 }
 
 #[test]
@@ -127,6 +150,24 @@ fn nobody_else_reaches_it_unless_told() {
     let help = String::from_utf8(output(&["sim", "--help"]).stdout).unwrap();
     let words: Vec<&str> = help.split_whitespace().collect();
     assert!(words.join(" ").contains("on 127.0.0.1:8410 unless told"), "{help}");
+}
+
+#[test]
+fn an_ipv4_address_in_the_form_of_ipv6_is_the_same_address() {
+    if let Err(error) = TcpListener::bind("[::ffff:127.0.0.1]:0") {
+        return eprintln!("an_ipv4_address_in_the_form_of_ipv6_is_the_same_address: skipped without IPv6: {error}");
+    }
+    for (address, answer) in [("[::ffff:127.0.0.1]:0", "HTTP/1.1 403 "), ("[::ffff:0.0.0.0]:0", "HTTP/1.1 200 ")] {
+        let pinion = Pinion::start(&["sim", "--show", "--camera", address]);
+        let line = pinion.logged("camera: http://");
+        let port = line.split("http://").nth(1).unwrap().split('/').next().unwrap().rsplit(':').next().unwrap();
+        let mut stream = TcpStream::connect(("127.0.0.1", port.parse().unwrap())).unwrap();
+        stream.set_read_timeout(Some(WAIT_MAX)).unwrap();
+        stream.write_all(b"GET /snapshot HTTP/1.1\r\nHost: evil.example\r\n\r\n").unwrap();
+        let mut answered = [0; 13];
+        stream.read_exact(&mut answered).unwrap();
+        assert_eq!(String::from_utf8_lossy(&answered), answer, "{address}");
+    }
 }
 
 #[test]

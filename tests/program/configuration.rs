@@ -101,3 +101,26 @@ fn a_bare_run_reads_no_file() {
     let help = String::from_utf8(output(&["run", "--help"]).stdout).unwrap();
     assert!(help.contains("--config <FILE>") && !help.contains("[default: /etc"), "{help}");
 }
+
+#[test]
+fn a_description_from_elsewhere_opens_no_file() {
+    let (folder, own) = folder_with("own", "keep");
+    let toml = folder.path().join("printer.toml");
+    fs::write(&toml, format!("[[spi_bus]]\nname = \"spidev0.0\"\ntrace_file = {own:?}\n")).unwrap();
+    let (toml, board) = (toml.to_str().unwrap(), format!("sim:{}", toml.display()));
+    let link = folder.path().join("tty");
+    for args in [
+        &["run", "--check", "--board", &board, "-I", link.to_str().unwrap()][..],
+        &["dict", "--board", &board],
+        &["console", "--board", &board],
+        &["sim", toml, "--print-config"],
+        &["sim", toml, "--show"],
+    ] {
+        let (code, out, log) = text(&output(args));
+        assert_eq!(fs::read_to_string(&own).unwrap(), "keep", "{args:?} emptied the file");
+        assert!(
+            code == Some(1) && (out + &log).contains("printer.toml:3:1: unknown field `trace_file`"),
+            "{args:?}: {log}"
+        );
+    }
+}

@@ -318,6 +318,13 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
             assert!(line.contains(&format!("process {}: dialect v0.12", host.0.id())), "{line}");
             let search = search_of(pinion.0.id()).unwrap();
             assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
+            // Another process of its user cannot get at them through its memory: the kernel asks for the same rights.
+            let other = Command::new("setpriv")
+                .args(["--reuid=65534", "--regid=65534", "--clear-groups", "dd", "count=1", "of=/dev/null"])
+                .arg(format!("if=/proc/{search}/environ"))
+                .output()
+                .unwrap();
+            assert!(String::from_utf8_lossy(&other.stderr).contains("Permission denied"), "{other:?}");
         } else {
             // Other klippys may run here, and they are hidden as well.
             until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");

@@ -3,9 +3,11 @@
 //! find it at all.
 
 use std::fs::{self, OpenOptions};
+use std::os::unix::fs::chown;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use nix::sys::signal::Signal;
 use pinion_client::Client;
 use pinion_testkit::here;
 
@@ -107,6 +109,45 @@ fn a_status_socket_that_cannot_be_made_keeps_no_host_out() {
     pinion.logged("pinion status will not be answered");
     pinion.logged("serving on");
     pinion.client().status().unwrap();
+}
+
+/// A user who may rename files there could have root give another file to the terminal's group.
+#[test]
+fn a_status_socket_is_not_made_in_a_folder_of_another_user() {
+    if !here::is_root() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let theirs = folder.path().join("theirs");
+    fs::create_dir(&theirs).unwrap();
+    chown(&theirs, Some(65534), None).unwrap();
+    let socket = theirs.join("s.sock");
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim", "--socket", socket.to_str().unwrap()]);
+    pinion.logged("serving on");
+    assert_eq!(fs::read_dir(theirs).unwrap().count(), 0);
+    pinion.logged("pinion trace --live will not be answered: ");
+    let told = pinion.logged("pinion status will not be answered: ");
+    assert!(told.contains("s.sock: the folder belongs to another user, nobody"), "{told}");
+}
+
+/// /run/pinion belongs to the service's user.
+#[test]
+fn root_beside_the_service_has_its_socket_elsewhere() {
+    if !here::is_root() || !here::may_mount() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let name = format!("files{}", std::process::id());
+    let link = format!("/tmp/klipper_host_{name}");
+    let prepare = "unset XDG_RUNTIME_DIR; mount -t tmpfs run /run; mkdir /run/pinion; chown nobody /run/pinion";
+    let mut pinion = Pinion::start_mounted(folder, prepare, &["run", "--board", "sim", "-I", &link]);
+    let told = pinion.logged("status on ");
+    pinion.logged("serving on");
+    let asked = output(&["status", "-I", &link]);
+    pinion.signal(Signal::SIGTERM);
+    pinion.end();
+    assert!(told.contains(&format!("status on /tmp/pinion-{name}.sock")), "{told}");
+    assert!(asked.status.success(), "{}", String::from_utf8_lossy(&asked.stderr));
 }
 
 #[test]

@@ -3,13 +3,15 @@
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::Output;
+use std::process::{Child, Command, Output};
 
+use pinion_testkit::here;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::process::output;
+use crate::process::{output, program_in};
 
 const GROUPS: [&str; 9] =
     ["last stop", "kernel", "service", "watchdog", "terminal", "host", "pins and buses", "permissions", "power"];
@@ -102,13 +104,51 @@ impl Tree {
     }
 
     fn process(&self, pid: u32, unit: &str, uid: u32, groups: &str, command: &[&str]) {
+        self.process_in(pid, &format!("/system.slice/{unit}.service"), uid, groups, command);
+    }
+
+    /// A process of this control group.
+    fn process_in(&self, pid: u32, control_group: &str, uid: u32, groups: &str, command: &[&str]) {
         self.put(&format!("proc/{pid}/cmdline"), &(command.join("\0") + "\0"));
         self.put(&format!("proc/{pid}/stat"), &format!("{pid} (x) S {}", vec!["1"; 40].join(" ")));
         self.put(
             &format!("proc/{pid}/status"),
             &format!("Uid:\t{uid}\t{uid}\nGid:\t{uid}\t{uid}\nGroups:\t{groups}\n"),
         );
-        self.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+        self.put(&format!("proc/{pid}/cgroup"), &format!("0::{control_group}\n"));
+        self.put(&format!("proc/{pid}/exe"), "");
+    }
+
+    /// The report about it.
+    fn doctor(&self) -> String {
+        stdout(&output(&["doctor", "--root", self.0.path().to_str().unwrap()]))
+    }
+
+    /// A computer with devices, a service and a klippy of the user pi. Only the groups may open the devices.
+    fn printer() -> Tree {
+        let tree = Tree(tempfile::tempdir().unwrap());
+        let gid = fs::metadata(tree.0.path()).unwrap().gid();
+        tree.put("etc/passwd", "root:x:0:0::/root:/bin/sh\npi:x:54321:54321::/home/pi:/bin/sh\npinion:x:990:990::/:/bin/false\nmallory:x:54322:54322::/home/mallory:/bin/sh\n");
+        tree.put("etc/group", &format!("disk:x:{gid}:\n"));
+        for file in ["dev/sda", "dev/ttyAMA0", "dev/serial/by-id/x", "run/docker.sock", "etc/shadow", "dev/pts/3"] {
+            tree.put(file, "");
+            fs::set_permissions(tree.0.path().join(file), fs::Permissions::from_mode(0o660)).unwrap();
+        }
+        for folder in ["tmp", "run/pinion", "dev/pts"] {
+            fs::create_dir_all(tree.0.path().join(folder)).unwrap();
+            fs::set_permissions(tree.0.path().join(folder), fs::Permissions::from_mode(0o755)).unwrap();
+        }
+        tree.put("etc/pinion/pinion.toml", "");
+        tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/x");
+        tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
+        tree.link("run/pinion/klipper_host_mcu", "/dev/pts/3");
+        let pinion =
+            ["/usr/bin/pinion", "run", "-I", "/run/pinion/klipper_host_mcu", "--config", "/etc/pinion/pinion.toml"];
+        tree.process(3, "pinion-mcu", 990, &gid.to_string(), &pinion);
+        tree.put("home/pi/printer.cfg", "[mcu host]\nserial: /tmp/klipper_host_mcu\n");
+        let klippy = ["/usr/bin/python3", "/home/pi/klipper/klippy/klippy.py", "/home/pi/printer.cfg"];
+        tree.process(4, "klipper", 54321, &gid.to_string(), &klippy);
+        tree
     }
 }
 
@@ -188,5 +228,181 @@ fn this_computer_is_looked_at_whatever_it_is() {
     assert_eq!(examined.status.code(), Some(status), "{value}");
     for finding in &findings {
         assert!(finding["status"] == "ok" || finding["remedy"].is_string(), "{finding}");
+    }
+}
+
+/// A user can have processes of any name, and configurations of any text.
+#[test]
+fn false_processes_of_another_user_change_no_advice() {
+    const MALLORY: u32 = 54_322;
+    let tree = Tree::printer();
+    let before = tree.doctor();
+    tree.put(
+        "home/mallory/printer.cfg",
+        "[mcu host]\nserial: /tmp/klipper_host_mcu\n[tmc2209 a]\nuart_pin: host:serial/../sda\n[tmc2209 b]\nuart_pin: host:serial/../../run/docker.sock\n[tmc2209 c]\nuart_pin: host:ttyAMA0\n[neopixel d]\npin: host:gpio18\n",
+    );
+    tree.put("home/mallory/pins.toml", "watchdog = true\ncpu = 77\n");
+    let commands: [&[&str]; 8] = [
+        &["pinion", "1000"],
+        &["pinion"],
+        &["/tmp/pinion", "run", "-r", "-I", "/tmp/klipper_host_mcu"],
+        &["pinion", "run", "--config", "/home/mallory/pins.toml"],
+        &["python3", "/home/mallory/klippy.py", "/home/mallory/printer.cfg"],
+        &["klipper_mcu", "-r"],
+        &["agetty", "ttyAMA0"],
+        &["hciattach", "/dev/ttyAMA0"],
+    ];
+    let slice = "/user.slice/user-54322.slice";
+    // A login, a unit of the user's own manager, a group that the user has made there, and a job of cron's.
+    let groups = [
+        format!("{slice}/session-7.scope"),
+        format!("{slice}/user@54322.service/app.slice/klipper.service"),
+        format!("{slice}/user@54322.service/system.slice/pinion-mcu.service"),
+        "/system.slice/cron.service".to_owned(),
+    ];
+    let mut pids = 100..;
+    for (group, command) in groups.iter().flat_map(|group| commands.map(|command| (group, command))) {
+        tree.process_in(pids.next().unwrap(), group, MALLORY, "", command);
+    }
+    let after = tree.doctor();
+    let told = "other users have processes with the names of a Pinion or a klippy, which do not count here: 100, 101, 102, 103, 104 and 15 more\n";
+    let remedy = "           -> if one of them is yours, have a service start it\n";
+    assert!(after.contains(told), "{after}");
+    assert_eq!(after.replace(&format!("  ok       {told}{remedy}"), ""), before);
+}
+
+#[test]
+fn a_name_in_the_configuration_that_leads_out_of_dev_opens_nothing() {
+    let tree = Tree::printer();
+    let doctor = |pin: &str| {
+        let config = format!("[mcu host]\nserial: /tmp/klipper_host_mcu\n[tmc2209 a]\nuart_pin: host:{pin}\n");
+        tree.put("home/pi/printer.cfg", &config);
+        tree.doctor()
+    };
+    // Nobody but the owner may open these.
+    for (name, mode) in [("dev/ttyAMA0", 0o060), ("dev/sda", 0o060), ("run/docker.sock", 0o060)] {
+        fs::set_permissions(tree.0.path().join(name), fs::Permissions::from_mode(mode)).unwrap();
+    }
+    tree.process(3, "pinion-mcu", 990, "", &["/usr/bin/pinion", "run"]);
+    let text = doctor("ttyAMA0");
+    assert!(text.contains("-> sudo usermod -aG disk pinion, then sudo systemctl restart pinion-mcu\n"), "{text}");
+    tree.link("dev/ttyX", "sda");
+    for pin in ["serial/../sda", "serial/../../run/docker.sock", "ttyX", "ttyAMA0;reboot", "serial/by-id/x"] {
+        let text = doctor(pin);
+        assert!(text.contains(&format!("  error    TMC UART: {pin} is no serial port\n")), "{text}");
+        assert!(!text.contains("usermod") && !text.contains("docker.sock,"), "{text}");
+    }
+}
+
+#[test]
+fn a_link_that_leads_to_another_file_makes_klippy_s_user_no_member_of_its_group() {
+    let tree = Tree::printer();
+    tree.process(4, "klipper", 54321, "", &["python3", "/home/pi/klipper/klippy/klippy.py", "/home/pi/printer.cfg"]);
+    let text = tree.doctor();
+    assert!(text.contains("-> sudo usermod -aG disk pi && sudo systemctl restart klipper\n"), "{text}");
+    for target in ["/etc/shadow", "/dev/sda", "/dev/pts/../sda", "/home"] {
+        fs::remove_file(tree.path("tmp/klipper_host_mcu")).unwrap();
+        tree.link("tmp/klipper_host_mcu", target);
+        let text = tree.doctor();
+        assert!(
+            text.contains(&format!("/tmp/klipper_host_mcu leads to {target}, which is no pseudo terminal\n")),
+            "{text}"
+        );
+        assert!(text.contains("-> sudo rm /tmp/klipper_host_mcu && sudo systemctl restart pinion-mcu\n"), "{text}");
+        assert!(!text.contains("usermod") && !text.contains("chmod"), "{text}");
+    }
+}
+
+#[test]
+fn marks_that_turn_a_line_around_are_not_printed() {
+    let tree = Tree::printer();
+    let folder = "/home/pi/\u{202e}klipper\u{200b}/klippy";
+    let script = format!("{folder}/klippy.py");
+    tree.process(4, "klipper", 54321, "", &["python3", &script, "/home/pi/printer.cfg"]);
+    let text = tree.doctor();
+    assert!(text.contains("/home/pi/?klipper?/klippy"), "{text}");
+    assert!(!text.contains(['\u{202e}', '\u{200b}']), "{text}");
+    let json = stdout(&output(&["doctor", "--json", "--root", tree.0.path().to_str().unwrap()]));
+    assert!(json.is_ascii() && json.contains("\\u202e"), "{json}");
+}
+
+/// Ends the process.
+struct False(Child);
+
+impl Drop for False {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A process of this user with another name, for an hour.
+fn called(name: &str, uid: u32) -> False {
+    let process = Command::new("sleep").arg0(name).arg("3600").uid(uid).gid(uid).spawn();
+    False(process.unwrap())
+}
+
+#[test]
+fn only_the_callers_own_processes_count_beside_those_of_services_and_root() {
+    const TEST: &str = "doctor::only_the_callers_own_processes_count_beside_those_of_services_and_root";
+    const MALLORY: u32 = 65_534;
+    if !nix::unistd::geteuid().is_root() {
+        return here::not_run("only root can start processes of other users");
+    }
+    here::among_own_processes(TEST, || {
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let program = program_in(folder.path());
+        let doctor = |uid: u32, sudo_uid: Option<&str>| {
+            let mut doctor = Command::new(&program);
+            doctor.args(["doctor", "--json"]).uid(uid).gid(uid).env_remove("SUDO_UID");
+            sudo_uid.map(|uid| doctor.env("SUDO_UID", uid));
+            let (_, _, findings) = parsed(&doctor.output().unwrap());
+            // All but what the processors are doing.
+            let findings: Vec<Value> = findings.into_iter().filter(|finding| finding["check"] != "latency").collect();
+            findings
+        };
+        let is_told = |findings: &[Value], words: &str| {
+            findings.iter().any(|finding| finding["found"].as_str().unwrap().contains(words))
+        };
+        let before = doctor(0, None);
+        let falses = ["pinion", "/tmp/klippy.py", "klipper_mcu"].map(|name| called(name, MALLORY));
+        let [pinion, klippy, _] = &falses;
+        let mut after = doctor(0, None);
+        let strangers = format!("which do not count here: {}, {}", pinion.0.id(), klippy.0.id());
+        assert!(is_told(&after, &strangers), "{after:#?}");
+        after.retain(|finding| finding["check"] != "strangers");
+        assert_eq!(after, before);
+        let counts = format!("Pinion runs as process {}", pinion.0.id());
+        assert!(is_told(&doctor(0, Some("65534")), &counts), "root's caller");
+        assert!(is_told(&doctor(MALLORY, None), &counts), "the user itself");
+        for other in [doctor(0, Some("12345")), doctor(12_345, None), doctor(12_345, Some("65534"))] {
+            assert!(!is_told(&other, &counts) && is_told(&other, &strangers), "{other:#?}");
+        }
+        let own = called("pinion", 0);
+        assert!(is_told(&doctor(0, None), &format!("Pinion runs as process {}", own.0.id())), "root's own");
+    });
+}
+
+#[test]
+fn whoever_runs_it_gets_advice_about_no_other_user() {
+    if !nix::unistd::geteuid().is_root() {
+        return here::not_run("only root can run it as other users");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
+    let program = program_in(folder.path());
+    let tty = nix::unistd::Group::from_name("tty").unwrap().map_or(5, |group| group.gid.as_raw());
+    // A member of no group, of tty, and of a group like gpio.
+    for groups in ["--clear-groups".to_owned(), format!("--groups={tty}"), "--groups=54321".to_owned()] {
+        let mut doctor = Command::new("setpriv");
+        doctor.args(["--reuid=12345", "--regid=12345", &groups]).arg(&program).args(["doctor", "--json"]);
+        let (_, _, findings) = parsed(&doctor.output().unwrap());
+        for remedy in findings.iter().filter_map(|finding| finding["remedy"].as_str()) {
+            if let Some((_, rest)) = remedy.split_once("usermod -aG ") {
+                let user = rest.split([' ', ',']).nth(1);
+                assert!(matches!(user, Some("12345" | "pinion")), "{remedy}");
+            }
+        }
     }
 }

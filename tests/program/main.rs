@@ -10,6 +10,7 @@ mod cut;
 mod dialects;
 mod disk;
 mod doctor;
+mod hostile;
 mod life;
 mod links;
 mod one_order;

@@ -18,15 +18,12 @@ fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
     let printer = String::from_utf8(output(&["sim", "--print-board"]).stdout).unwrap();
     let slow = printer.replace(
         "name = \"spidev0.0\"\n",
-        &format!(
-            "name = \"spidev0.0\"\ndelay_us = {}\ntrace_file = {trace:?}\ntrace_pins = [\"beeper\"]\n",
-            1000 * delay_ms
-        ),
+        &format!("name = \"spidev0.0\"\ndelay_us = {}\ntrace_pins = [\"beeper\"]\n", 1000 * delay_ms),
     );
     assert_ne!(slow, printer, "the built-in printer's bus has another name");
     fs::write(&toml, slow).unwrap();
-    let board = format!("sim:{}", toml.display());
-    let pinion = Pinion::start_in(folder, &["run", "--board", &board]);
+    let [board, record] = [&toml, &trace].map(|path| path.to_str().unwrap());
+    let pinion = Pinion::start_in(folder, &["sim", board, "--spi-trace", record]);
     pinion.wait_for_link();
     (pinion, trace)
 }

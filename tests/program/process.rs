@@ -60,6 +60,19 @@ impl Pinion {
         Pinion { child, folder }
     }
 
+    /// `pinion run` on the simulated printer, as an ordinary user. The service is one, and root may do more.
+    pub fn start_as_nobody(args: &[&str]) -> Pinion {
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o1777)).unwrap();
+        let log = File::create(folder.path().join("log")).unwrap();
+        let mut command = Command::new(program_in(folder.path()));
+        command.args(["run", "--board", "sim"]).args(args).arg("-I").arg(folder.path().join("tty"));
+        let child = as_nobody(&mut command).env_remove("JOURNAL_STREAM").stderr(log).spawn().unwrap();
+        let pinion = Pinion { child, folder };
+        pinion.logged("serving on");
+        pinion
+    }
+
     /// `pinion` with its own view of the file system. A shell prepares it, in the program's folder. Needs root.
     pub fn start_mounted(folder: TempDir, prepare: &str, args: &[&str]) -> Pinion {
         let log = File::create(folder.path().join("log")).unwrap();
@@ -211,6 +224,14 @@ pub fn program() -> Command {
     program
 }
 
+/// The same command as an ordinary user.
+pub fn as_nobody(command: &mut Command) -> &mut Command {
+    if nix::unistd::geteuid().is_root() {
+        command.uid(65534).gid(65534);
+    }
+    command
+}
+
 /// A copy of the program in this folder, because nobody else may read cargo's. Another process copies it. A test that
 /// starts a program meanwhile would inherit our file, and a file that is open for writing cannot be run.
 pub fn program_in(folder: &Path) -> PathBuf {
@@ -237,6 +258,14 @@ pub fn closed_pipe() -> std::io::PipeWriter {
 /// Runs `pinion` to its end.
 pub fn output(args: &[&str]) -> std::process::Output {
     Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap()
+}
+
+/// The same with at most 3 GB of memory, and not forever. Returns its status and all that it printed.
+pub fn limited(args: &[&str]) -> (Option<i32>, String) {
+    let mut limited = Command::new("sh");
+    limited.args(["-c", "ulimit -v 3000000; exec timeout 100 \"$0\" \"$@\"", env!("CARGO_BIN_EXE_pinion")]);
+    let output = limited.args(args).output().unwrap();
+    (output.status.code(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
 }
 
 pub fn exists(path: &Path) -> bool {

@@ -2,21 +2,27 @@
 //! The flight recorder: each stop leaves a trace and a verdict.
 
 use std::fs::{self, File};
-use std::io::Write;
-use std::os::unix::fs::PermissionsExt;
+use std::io::{Read, Write};
+use std::os::fd::AsFd;
+use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 use pinion::trace::event::Event;
 use pinion::trace::file::{End, Trace};
 use pinion_client::Client;
 use pinion_protocol::block::{Refusal, Sequence, frame};
+use pinion_testkit::here;
 
 use crate::process::{Pinion, WAIT_MAX};
+
+/// The user `nobody`.
+const NOBODY: u32 = 65534;
 
 /// The traces that the program has kept.
 fn kept(pinion: &Pinion) -> Vec<PathBuf> {
@@ -191,4 +197,102 @@ fn a_folder_that_takes_no_file_is_a_warning() {
     pinion.logged("the trace of this stop is not kept: ");
     client.reset().unwrap();
     assert!(!client.status().unwrap().is_shutdown);
+}
+
+/// The user of the service may put links into its folder. Root's Pinion beside the service must not write through them.
+#[test]
+fn root_writes_nothing_into_a_folder_of_another_user() {
+    if !here::is_root() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (state, victim) = (folder.path().join("state"), folder.path().join("victim"));
+    fs::create_dir(&state).unwrap();
+    chown(&state, Some(NOBODY), None).unwrap();
+    fs::write(&victim, "root's").unwrap();
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.wait_for_link();
+    symlink(&victim, state.join(format!(".tty.{}", pinion.pid()))).unwrap();
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    client.send_line("emergency_stop").unwrap();
+    pinion.logged("nobody was late");
+    assert_eq!(fs::read(&victim).unwrap(), b"root's");
+    assert_eq!(kept(&pinion).len(), 1, "only the link is there");
+    pinion.logged("state: the folder belongs to another user, nobody");
+}
+
+/// As users of the socket's group may do. A recording is larger than what the kernel keeps for a client.
+#[test]
+fn clients_that_do_not_read_keep_no_stop_from_its_recording() {
+    let pinion = Pinion::simulated(&["--trace-edges"]);
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    let ask = || UnixStream::connect(pinion.link().with_extension("trace")).unwrap();
+    let read = |mut stream: UnixStream| {
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).unwrap();
+        bytes
+    };
+    while read(ask()).len() < 300_000 {
+        for value in (0..20_000).map(|n| n % 2) {
+            client.send_line(&format!("update_digital_out oid=0 value={value}")).unwrap();
+        }
+        client.status().unwrap();
+    }
+    let idle = [ask(), ask(), ask()];
+    for stream in &idle {
+        let mut fds = [PollFd::new(stream.as_fd(), PollFlags::POLLIN)];
+        poll(&mut fds, PollTimeout::NONE).unwrap();
+    }
+    client.send_line("emergency_stop").unwrap();
+    verdict(&pinion, "nobody was late");
+    for stream in idle {
+        let bytes = read(stream);
+        // Their recordings would have been cut off by the time limit before the verdict.
+        let mut all = Vec::new();
+        flate2::read::GzDecoder::new(bytes.as_slice()).read_to_end(&mut all).unwrap();
+    }
+}
+
+/// Each FIRMWARE_RESTART is a stop that the host asks for.
+#[test]
+fn restarts_remove_no_recording_of_a_failure() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    let late = client.clock_in(-2.0).unwrap().wire();
+    client.send_line(&format!("queue_digital_out oid=0 clock={late} on_ticks=1")).unwrap();
+    client.wait_shutdown(WAIT_MAX).unwrap();
+    pinion.logged("look at the host's load");
+    let failure = kept(&pinion);
+    for count in 1..=12 {
+        client.reset().unwrap();
+        configure(&mut client, &[OUTPUT]);
+        client.send_line("emergency_stop").unwrap();
+        pinion.until("the verdict", || pinion.log().matches("nobody was late").count() == count);
+    }
+    let mut kept = kept(&pinion);
+    kept.retain(|path| !path.to_string_lossy().ends_with("-asked.trace"));
+    assert_eq!(kept, failure);
+    assert_eq!(fs::read_dir(pinion.state()).unwrap().count(), 2);
+    pinion.logged("(no trace: such a stop was recorded less than a minute before)");
+}
+
+/// A computer without a clock has a wrong time until its network is up.
+#[test]
+fn a_recording_with_a_time_in_the_future_is_not_the_newest_for_ever() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("state")).unwrap();
+    fs::write(folder.path().join("state/tty-99981122T142614.321Z.trace"), "x").unwrap();
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.wait_for_link();
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    client.send_line("emergency_stop").unwrap();
+    pinion.logged("(pinion trace ");
+    let mut newest = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let newest = newest.arg("trace").env("STATE_DIRECTORY", pinion.state()).output().unwrap();
+    let page = String::from_utf8_lossy(&newest.stdout);
+    assert!(page.starts_with("verdict: nobody was late"), "{page}{}", String::from_utf8_lossy(&newest.stderr));
 }

@@ -92,6 +92,42 @@ fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
 }
 
 #[test]
+fn a_shutdown_is_shown_until_the_host_restarts_the_mcu() {
+    let mut pinion = Pinion::start(&["sim", "--show"]);
+    pinion.wait_for_link();
+    let mut client = drive(&pinion.link());
+    pinion.until("its state", || pinion.out().contains("] mcu: runs\n"));
+    client.emergency_stop().unwrap();
+    pinion.until("the shutdown", || pinion.out().contains("] mcu: SHUT DOWN: Command request; the log says more\n"));
+    client.reset().unwrap();
+    pinion.until("the restart", || pinion.out().matches("] mcu: runs\n").count() == 2);
+    drop(client);
+    pinion.signal(Signal::SIGTERM);
+    pinion.end();
+}
+
+#[test]
+fn a_terminal_of_another_size_gets_the_picture_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut pinion, link) = show(&folder);
+    pinion.until("mcu");
+    for (rows, columns) in [(30, 60), (30, 100), (50, 100)] {
+        pinion.resize(rows, columns);
+        // All rows scroll, the old picture below the cursor is deleted, and the picture has its own rows again.
+        pinion.until("\x1b7\x1b[r\x1b8\x1b[999M");
+        pinion.until("axes");
+    }
+    // On a small terminal a shutdown still has its row.
+    pinion.resize(8, 100);
+    let mut client = drive(&link);
+    client.emergency_stop().unwrap();
+    pinion.until("SHUT DOWN: Command request");
+    drop(client);
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.ended().code(), Some(0));
+}
+
+#[test]
 fn q_ends_the_program_and_gives_the_keys_back() {
     let folder = tempfile::tempdir().unwrap();
     let (mut pinion, link) = show(&folder);

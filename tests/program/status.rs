@@ -226,6 +226,87 @@ fn a_page_that_is_longer_than_the_terminal_is_scrolled_by_keys() {
     assert!(watch.ended().success());
 }
 
+#[test]
+fn keys_that_arrive_together_all_count() {
+    let pinion = Pinion::simulated(&[]);
+    let mut watch = AtTerminal::start(&mut watch(&pinion), 5, None);
+    watch.until("lines 1 to 4 of ");
+    watch.press("jjj");
+    watch.until("lines 4 to 7 of ");
+    watch.press("\x1b[A\x1b[Akq");
+    assert!(watch.ended().success());
+    assert!(watch.shown().contains("lines 3 to 6 of "), "the keys before q, too: {:?}", watch.shown());
+}
+
+#[test]
+fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    for command in CONFIGURATION {
+        client.send_line(command).unwrap();
+    }
+    client.emergency_stop().unwrap();
+    let detail = status(&pinion)["shutdown"]["detail"].as_str().unwrap().to_owned();
+    let mut watch = AtTerminal::start(&mut watch(&pinion), 60, None);
+    watch.resize(60, 40);
+    // The foot has no line feed.
+    let page = watch.wait_for("a page of the new size", |watch| {
+        let shown = watch.shown();
+        let pages: Vec<&str> = shown.split("\x1b[1;1H").collect();
+        let page = pages[..pages.len() - 1].last()?.replace("\x1b[0K", "");
+        let rows: Vec<&str> = page.lines().map(|row| row.trim_end_matches('\r')).collect();
+        (pages.len() > 2 && rows.iter().all(|row| row.chars().count() <= 40)).then_some(page.clone())
+    });
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(words(&page).contains(&words(&detail)), "{page}");
+}
+
+#[test]
+fn what_is_measured_is_first_and_pins_are_last() {
+    let pinion = Pinion::simulated(&["--dialect", "master"]);
+    let mut client = pinion.client();
+    for command in CONFIGURATION {
+        client.send_line(command).unwrap();
+    }
+    let clock = client.clock_in(0.1).unwrap().wire();
+    client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
+    assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
+    let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
+    let row =
+        |text: &str| page.lines().position(|line| line.contains(text)).unwrap_or_else(|| panic!("{text}: {page}"));
+    assert_eq!(row("objects "), row("bed_sensor"), "{page}");
+    assert!(row("bed_sensor") < row("digital output") && row("x_dir") > row("lines "), "{page}");
+    assert!(row("lines ") > row("stepper"), "{page}");
+}
+
+#[test]
+fn the_folder_is_the_one_that_takes_recordings() {
+    let folder = tempfile::tempdir().unwrap();
+    let (none, state) = (folder.path().join("none"), folder.path().join("state"));
+    // A file is no folder, even for root.
+    fs::write(&none, "").unwrap();
+    fs::create_dir(&state).unwrap();
+    let link = folder.path().join("tty");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["run", "--board", "sim", "-I"])
+        .arg(&link)
+        .env("STATE_DIRECTORY", format!("{}:{}", none.display(), state.display()))
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let socket = link.with_file_name("tty.sock");
+    let end = Instant::now() + WAIT_MAX;
+    while !exists(&socket) && Instant::now() < end {
+        thread::sleep(std::time::Duration::from_millis(10));
+    }
+    let asked =
+        Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status", "--json", "-I"]).arg(&link).output().unwrap();
+    let _ = child.kill();
+    let _ = child.wait();
+    let status: Value = serde_json::from_slice(&asked.stdout).unwrap();
+    assert_eq!(status["recorder"]["folder"], state.to_str().unwrap());
+}
+
 /// Other clients also ask, more than fit into the socket's queue.
 #[test]
 fn a_crowd_is_waited_for_and_then_named() {

@@ -41,8 +41,7 @@ impl AtTerminal {
         options.read(true).write(true).custom_flags(OFlag::O_NOCTTY.bits());
         let slave = options.open(ptsname_r(&master).unwrap()).unwrap();
         let end = || Stdio::from(slave.try_clone().unwrap());
-        let mut size = Command::new("stty");
-        assert!(size.args(["rows", &rows.to_string(), "cols", "100"]).stdin(end()).status().unwrap().success());
+        resize(&slave, rows, 100);
         let before = tcgetattr(&slave).unwrap();
         let child = command.stdin(end()).stdout(end()).stderr(log.unwrap_or_else(end)).spawn().unwrap();
         AtTerminal { child, master: Some(master), slave, before, shown: Vec::new(), at_key: 0 }
@@ -90,6 +89,13 @@ impl AtTerminal {
         self.master.as_mut().unwrap().write_all(keys.as_bytes()).unwrap();
     }
 
+    /// Gives the terminal another size, as a window does.
+    pub fn resize(&mut self, rows: u16, columns: u16) {
+        while self.read() {}
+        self.at_key = self.shown.len();
+        resize(&self.slave, rows, columns);
+    }
+
     pub fn signal(&self, signal: Signal) {
         kill(Pid::from_raw(self.pid() as i32), signal).unwrap();
     }
@@ -124,6 +130,12 @@ impl AtTerminal {
     pub fn is_given_back(&self) -> bool {
         tcgetattr(&self.slave).unwrap() == self.before
     }
+}
+
+fn resize(terminal: &File, rows: u16, columns: u16) {
+    let mut size = Command::new("stty");
+    size.args(["rows", &rows.to_string(), "cols", &columns.to_string()]).stdin(terminal.try_clone().unwrap());
+    assert!(size.status().unwrap().success());
 }
 
 impl Drop for AtTerminal {

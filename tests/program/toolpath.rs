@@ -2,12 +2,14 @@
 //! `pinion sim --toolpath` and `--compare`: files, errors and exit statuses.
 
 use std::fs;
+use std::net::TcpListener;
+use std::os::unix::fs::symlink;
 use std::thread;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
-use crate::process::{Pinion, folder_with, output};
+use crate::process::{Pinion, folder_with, limited, output};
 
 /// Moves the x axis forward by 200 steps of 1/80 mm.
 const MOVE: &[&str] = &[
@@ -56,6 +58,7 @@ fn a_wrong_file_is_one_line_before_the_printer_starts() {
         (&["--toolpath", "/nonexistent/path.svg"], "/nonexistent/path.svg cannot be written: "),
         (&["--compare", "/nonexistent/part.gcode"], "/nonexistent/part.gcode: No such file"),
         (&["--compare", bad], "bad.gcode:2: `X1.2.3` has no number: correct it"),
+        (&["--spi-trace", "/nonexistent/spi"], "/nonexistent/spi cannot be written: "),
         (&["--compare", gcode, "--within", "0"], "--within 0 is no distance: give millimeters above 0"),
     ] {
         let output = output(&[&["sim"], args].concat());
@@ -73,4 +76,54 @@ fn a_file_that_was_not_printed_is_an_error_at_the_end() {
     pinion.signal(Signal::SIGTERM);
     assert_eq!(pinion.end().code(), Some(1), "{}", pinion.log());
     assert!(pinion.log().contains("part.gcode: the motors never went along the path of this file"), "{}", pinion.log());
+}
+
+#[test]
+fn a_small_file_takes_no_more_memory_than_a_print() {
+    for (arc, told) in [
+        ("G2 I99999999999\n", "part.gcode:2: `I99999999999` is out of range: correct it"),
+        ("G2 I90000\n", ": the path up to here is too long to be compared: correct its places and arcs"),
+    ] {
+        let (folder, gcode) = folder_with("part.gcode", &format!("G1 X1 Y1 Z1\n{}", arc.repeat(2000)));
+        let (code, said) = limited(&["sim", "--compare", gcode.to_str().unwrap()]);
+        assert_eq!((code, said.lines().count()), (Some(1), 1), "{said}");
+        assert!(said.contains(told), "{said}");
+        drop(folder);
+    }
+}
+
+#[test]
+fn a_file_that_is_read_is_never_replaced() {
+    let text = "G1 X1 Y1 Z1\nG1 X2\n";
+    let (folder, gcode) = folder_with("part.gcode", text);
+    let board = folder.path().join("printer.gcode");
+    fs::write(&board, "").unwrap();
+    let name = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    fs::hard_link(&gcode, name("hard.gcode")).unwrap();
+    symlink("part.gcode", name("soft.gcode")).unwrap();
+    let part = name("part.gcode");
+    for other in ["part.gcode", "./part.gcode", "hard.gcode", "soft.gcode", "printer.gcode"] {
+        for option in ["--toolpath", "--spi-trace"] {
+            let (code, said) = limited(&["sim", &name("printer.gcode"), "--compare", &part, option, &name(other)]);
+            assert_eq!((code, said.lines().count()), (Some(1), 1), "{said}");
+            assert!(said.contains(" is the same file as "), "{said}");
+            assert_eq!(fs::read_to_string(&gcode).unwrap(), text, "{option} {other}");
+        }
+    }
+    let (_, said) = limited(&["dict", "--board", &format!("sim:{}", board.display()), "-o", &name("./printer.gcode")]);
+    assert!(said.contains(" is the same file as "), "{said}");
+}
+
+#[test]
+fn a_start_that_fails_leaves_no_file() {
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    let folder = tempfile::tempdir().unwrap();
+    let [path, spi] = ["path.svg", "spi"].map(|name| folder.path().join(name).to_str().unwrap().to_owned());
+    let mut pinion = Pinion::start(&["sim", "--camera", &address, "--toolpath", &path, "--spi-trace", &spi]);
+    assert_eq!(pinion.end().code(), Some(1), "{}", pinion.log());
+    // A link that cannot be made is found last.
+    let said = output(&["sim", "--toolpath", &path, "--spi-trace", &spi, "-I", "/nonexistent/tty"]);
+    assert_eq!(said.status.code(), Some(1));
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }

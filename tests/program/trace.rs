@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion trace`: recordings from files, from the folders, and from a running Pinion.
 
+use std::collections::HashMap;
 use std::fs;
 use std::io::Write;
 use std::os::unix::net::UnixListener;
@@ -13,6 +14,8 @@ use pinion::trace::file::{End, Head, Names, Thread, Trace};
 use pinion_firmware::time::{Clock, Ticks};
 use serde_json::Value;
 use tempfile::TempDir;
+
+use crate::process::{Pinion, WAIT_MAX};
 
 /// When the recording ended, in ticks.
 const END: u64 = 10 * SECOND;
@@ -153,6 +156,98 @@ fn files_for_other_programs_are_written() {
     assert!(fs::read_to_string(svg).unwrap().trim_end().ends_with("</svg>"));
     let said = complaint(&trace(folder.path(), &[path.to_str().unwrap(), "--svg", "/nonexistent/x"]));
     assert!(said.contains("/nonexistent/x cannot be written: No such file"), "{said}");
+}
+
+/// A motor, a heater and a fan run until the host stops the MCU.
+const RUNNING: [&str; 8] = [
+    "allocate_oids count=6",
+    "config_stepper oid=0 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
+    "config_digital_out oid=1 pin=x_enable value=1 default_value=1 max_duration=0",
+    "config_digital_out oid=2 pin=hotend_heater value=0 default_value=0 max_duration=0",
+    "config_digital_out oid=3 pin=fan value=0 default_value=0 max_duration=0",
+    "config_digital_out oid=4 pin=led value=0 default_value=1 max_duration=0",
+    "config_buttons oid=5 button_count=1",
+    "finalize_config crc=1",
+];
+
+/// The last value and the last change of each wire in a VCD.
+fn wires(vcd: &str) -> HashMap<String, (char, u64)> {
+    let (mut names, mut wires, mut now) = (HashMap::new(), HashMap::new(), 0);
+    for line in vcd.lines() {
+        if let ["$var", "wire", "1", id, name, "$end"] = line.split(' ').collect::<Vec<_>>()[..] {
+            names.insert(id.to_owned(), name.to_owned());
+        } else if let Some(at) = line.strip_prefix('#') {
+            now = at.parse().unwrap();
+        } else if let Some(name) = line.get(1..).and_then(|id| names.get(id)) {
+            wires.insert(name.clone(), (line.chars().next().unwrap(), now));
+        }
+    }
+    wires
+}
+
+#[test]
+fn all_exports_show_what_the_stop_did() {
+    let pinion = Pinion::simulated(&["--trace-edges"]);
+    let mut client = pinion.client();
+    RUNNING.iter().for_each(|line| client.send_line(line).unwrap());
+    assert!(client.status().unwrap().is_config);
+    let ack = "buttons_ack oid=%c count=%c";
+    assert!(client.dictionary().commands[ack].as_i64().unwrap() < 0, "it does not test negative ids");
+    for _ in 0..9 {
+        client.send_line("buttons_ack oid=5 count=0").unwrap();
+    }
+    for line in ["oid=1 value=0", "oid=2 value=1", "oid=3 value=1"] {
+        client.send_line(&format!("update_digital_out {line}")).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    client.send_line("emergency_stop").unwrap();
+    assert!(client.wait_shutdown(WAIT_MAX).unwrap().is_some());
+    let log = pinion.logged("(pinion trace ");
+    let (_, path) = log.split_once("(pinion trace ").unwrap();
+    let path = path.trim_end_matches(')');
+
+    let folder = pinion.folder().path();
+    let [vcd, json, svg] = ["a.vcd", "a.json", "a.svg"].map(|name| folder.join(name));
+    let [to_vcd, to_json, to_svg] = [&vcd, &json, &svg].map(|path| path.to_str().unwrap());
+    out(&trace(folder, &[path, "--vcd", to_vcd, "--perfetto", to_json, "--svg", to_svg]));
+
+    let timeline = out(&trace(folder, &[path]));
+    assert!(timeline.contains("buttons_ack "), "{timeline}");
+
+    let mut levels = HashMap::new();
+    let json: Value = serde_json::from_slice(&fs::read(json).unwrap()).unwrap();
+    let events = json["traceEvents"].as_array().unwrap();
+    for event in events {
+        let name = event["name"].as_str().unwrap();
+        assert!(!name.starts_with("command "), "{name}");
+        if let Some(level) = event["args"]["level"].as_f64() {
+            levels.insert(name.to_owned(), level);
+        }
+    }
+    assert!(events.iter().any(|event| event["name"] == "buttons_ack"));
+
+    let wires = wires(&fs::read_to_string(vcd).unwrap());
+    let expected = [("x_enable", 1.0), ("hotend_heater", 0.0), ("fan", 0.0), ("led", 1.0), ("x_step", 0.0)];
+    for (name, level) in expected {
+        assert_eq!(levels[name], level, "{name}");
+    }
+    for (name, level) in levels {
+        let (value, at) = wires[&name];
+        assert_eq!(value, if level > 0.5 { '1' } else { '0' }, "{name}");
+        let is_switched = ["x_enable", "hotend_heater", "fan", "led"].contains(&name.as_str());
+        assert_eq!(at >= wires["mcu_stopped"].1, is_switched, "{name}");
+    }
+
+    let svg = fs::read_to_string(svg).unwrap();
+    let document = roxmltree::Document::parse(&svg).unwrap();
+    let texts: Vec<&str> =
+        document.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect();
+    for name in ["x_step", "x_enable", "hotend_heater", "fan", "led"] {
+        assert!(texts.contains(&name), "{name}");
+    }
+    let words: Vec<&str> = texts.iter().flat_map(|text| text.split_whitespace()).collect();
+    let verdict = timeline.lines().next().unwrap();
+    assert!(words.join(" ").contains(verdict), "{verdict}");
 }
 
 #[test]

@@ -1,14 +1,16 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Debian's arm64: libraries to build against, busybox, and the kernel with the
-//! description of the Raspberry Pi 3.
+//! Debian's arm64: libraries to build against, busybox, and the kernel with the descriptions of the boards. And the
+//! emulator of a newer Debian.
 //!
-//! The computer's dpkg learns nothing of arm64. It only gets the compilers and the emulator, which are ordinary packages.
+//! These packages are only unpacked. The computer's dpkg learns nothing of them. It only gets the compilers, which are
+//! ordinary packages.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use super::board::{BOARDS, Board};
 use pinion_testkit::apt::{self, Apt};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::{process, tools};
@@ -19,10 +21,9 @@ pub const RUSTC: &str = "/usr/bin/rustc";
 const RUSTC_PACKAGE: &str = "rustc-web";
 /// Cross gcc, strip and readelf begin with it.
 pub const TOOL_PREFIX: &str = "aarch64-linux-gnu-";
-pub const EMULATOR: &str = "qemu-system-aarch64";
 
 /// What the host gets.
-const TOOLS: [&str; 4] = ["qemu-system-arm", "gcc-aarch64-linux-gnu", "libc6-dev-arm64-cross", RUSTC_PACKAGE];
+const TOOLS: [&str; 3] = ["gcc-aarch64-linux-gnu", "libc6-dev-arm64-cross", RUSTC_PACKAGE];
 /// What pinion links to; unpacked with all that it depends on.
 const LIBRARY: &str = "libiio-dev";
 /// Unpacked alone.
@@ -30,9 +31,49 @@ const STANDARD_LIBRARY: &str = "libstd-rust-web-dev";
 const BUSYBOX: &str = "busybox-static";
 /// The package which always depends on the newest kernel.
 const KERNEL: &str = "linux-image-arm64";
-const DEVICE_TREE: &str = "broadcom/bcm2837-rpi-3-b.dtb";
+/// Begins an error of apt.
+const NOT_OFFERED: &str = "apt offers not all packages: check the network, and that its sources name a Debian archive";
 
-/// The unpacked packages.
+/// The first Debian whose QEMU has every board: QEMU 9 added the Raspberry Pi 4.
+const EMULATOR_RELEASE: &str = "trixie";
+const EMULATOR_PACKAGE: &str = "qemu-system-arm";
+
+/// QEMU for ARM, unpacked with its libraries.
+pub struct Emulator {
+    /// The dynamic loader, which is beside the libraries. The computer's own libraries are too old.
+    loader: PathBuf,
+    folder: PathBuf,
+}
+
+impl Emulator {
+    /// Downloads what the cache does not hold yet.
+    pub fn prepare(cache: &Cache) -> Result<Emulator, String> {
+        let _lock = cache.lock()?;
+        let root = cache.root().join("emulator");
+        let architecture = process::output(Command::new("dpkg").arg("--print-architecture"))?;
+        let apt = Apt::open(&root.join("apt"), architecture.trim(), Some(EMULATOR_RELEASE))?;
+        let packages = Packages::of(&apt, EMULATOR_PACKAGE, Vec::new())?;
+        let folder = packages.unpacked(&apt, &root, &format!("QEMU of Debian {EMULATOR_RELEASE}"))?;
+        let pattern = folder.join("usr/lib/*/ld-linux*.so.*");
+        let mut loaders = glob::glob(&pattern.to_string_lossy()).map_err(|error| error.to_string())?;
+        let loader = loaders.find_map(Result::ok).ok_or_else(|| format!("there is no {}", pattern.display()))?;
+        Ok(Emulator { loader, folder })
+    }
+
+    pub fn command(&self) -> Command {
+        let libraries = self.loader.parent().expect("a file has a folder");
+        let mut command = Command::new(&self.loader);
+        command
+            .arg("--library-path")
+            .arg(libraries)
+            .arg(self.folder.join("usr/bin/qemu-system-aarch64"))
+            // Otherwise it tries the modules of the computer's QEMU.
+            .env("QEMU_MODULE_DIR", libraries.join("qemu"));
+        command
+    }
+}
+
+/// The unpacked packages of arm64.
 pub struct Sysroot {
     /// As `uname -r` will print it.
     pub release: String,
@@ -47,15 +88,10 @@ impl Sysroot {
         let root = cache.root().join("arm64");
         let apt = Apt::open(&root.join("apt"), "arm64", None)?;
         let release = kernel_release(&apt)?;
-        let packages = Packages::of(&apt, &release)?;
-        let folder = root.join(format!("sysroot-{:016x}", packages.key()));
-        if !folder.exists() {
-            eprintln!("fetching {} packages of Debian's arm64, with Linux {release}", packages.files.len());
-            remove_others(&root, &folder)?;
-            let partial = folder.with_extension("partial");
-            packages.unpack(&apt, &partial)?;
-            fs::rename(&partial, &folder).map_err(|error| describe("rename", &partial, &error))?;
-        }
+        let rustc = installed_version(RUSTC_PACKAGE)?;
+        let alone = vec![format!("{STANDARD_LIBRARY}={rustc}"), BUSYBOX.to_owned(), format!("linux-image-{release}")];
+        let packages = Packages::of(&apt, LIBRARY, alone)?;
+        let folder = packages.unpacked(&apt, &root, &format!("Debian's arm64 with Linux {release}"))?;
         Ok(Sysroot { release, folder })
     }
 
@@ -67,8 +103,8 @@ impl Sysroot {
         self.folder.join(format!("boot/vmlinuz-{}", self.release))
     }
 
-    pub fn device_tree(&self) -> PathBuf {
-        self.folder.join(format!("usr/lib/linux-image-{}", self.release)).join(DEVICE_TREE)
+    pub fn device_tree(&self, board: &Board) -> PathBuf {
+        self.folder.join(format!("usr/lib/linux-image-{}", self.release)).join(board.device_tree)
     }
 
     pub fn busybox(&self) -> PathBuf {
@@ -116,12 +152,8 @@ fn installed_version(package: &str) -> Result<String, String> {
 /// The release of its newest kernel, as `uname -r` prints it.
 fn kernel_release(apt: &Apt) -> Result<String, String> {
     let mut show = apt.command("apt-cache");
-    let shown = process::output(show.args(["show", "--no-all-versions", KERNEL])).map_err(|cause| {
-        format!(
-            "apt offers no {KERNEL} for arm64: is there a network, and one of Debian's archives among apt's sources? \
-             {cause}"
-        )
-    })?;
+    let shown = process::output(show.args(["show", "--no-all-versions", KERNEL]))
+        .map_err(|cause| format!("{NOT_OFFERED}: {cause}"))?;
     shown
         .lines()
         .find_map(|line| line.strip_prefix("Depends: linux-image-")?.split(' ').next())
@@ -129,17 +161,17 @@ fn kernel_release(apt: &Apt) -> Result<String, String> {
         .ok_or_else(|| format!("{KERNEL} depends on no kernel that this suite knows:\n{shown}"))
 }
 
-/// What is unpacked.
+/// Packages to unpack.
 struct Packages {
+    /// Unpacked with all that it depends on.
+    whole: &'static str,
     alone: Vec<String>,
     /// Their files' names; they contain the versions.
     files: Vec<String>,
 }
 
 impl Packages {
-    fn of(apt: &Apt, release: &str) -> Result<Packages, String> {
-        let version = installed_version(RUSTC_PACKAGE)?;
-        let alone = vec![format!("{STANDARD_LIBRARY}={version}"), BUSYBOX.to_owned(), format!("linux-image-{release}")];
+    fn of(apt: &Apt, whole: &'static str, alone: Vec<String>) -> Result<Packages, String> {
         let print = |arguments: &[&str], packages: &[String]| -> Result<Vec<String>, String> {
             let mut command = apt.command("apt-get");
             command.args(arguments).args(["-qq", "--print-uris"]).args(packages);
@@ -147,23 +179,40 @@ impl Packages {
             let list = process::output(&mut command)?;
             Ok(list.lines().filter_map(|line| line.split(' ').nth(1)).map(str::to_owned).collect())
         };
-        let mut files = print(&["install"], &[LIBRARY.to_owned()])?;
-        files.extend(print(&["download"], &alone).map_err(|cause| {
-            format!(
-                "apt offers no standard library for {RUSTC_PACKAGE} {version}; \
-                 sudo apt-get update && sudo apt-get install {RUSTC_PACKAGE} may help: {cause}"
-            )
-        })?);
+        let mut files = print(&["install"], &[whole.to_owned()]).map_err(|cause| format!("{NOT_OFFERED}: {cause}"))?;
+        if !alone.is_empty() {
+            files.extend(print(&["download"], &alone).map_err(|cause| {
+                format!(
+                    "apt does not offer all of {}; \
+                     sudo apt-get update && sudo apt-get install {RUSTC_PACKAGE} may help: {cause}",
+                    alone.join(" ")
+                )
+            })?);
+        }
         files.sort();
-        Ok(Packages { alone, files })
+        Ok(Packages { whole, alone, files })
     }
 
     /// Changes with everything that is unpacked.
     fn key(&self) -> u64 {
         let mut hasher = DefaultHasher::new();
         include_str!("debian.rs").hash(&mut hasher);
+        BOARDS.each_ref().map(|board| board.device_tree).hash(&mut hasher);
         self.files.hash(&mut hasher);
         hasher.finish()
+    }
+
+    /// The folder below `root` where they are unpacked, downloaded if necessary.
+    fn unpacked(&self, apt: &Apt, root: &Path, what: &str) -> Result<PathBuf, String> {
+        let folder = root.join(format!("sysroot-{:016x}", self.key()));
+        if !folder.exists() {
+            eprintln!("fetching {what}, {} packages", self.files.len());
+            remove_others(root, &folder)?;
+            let partial = folder.with_extension("partial");
+            self.unpack(apt, &partial)?;
+            fs::rename(&partial, &folder).map_err(|error| describe("rename", &partial, &error))?;
+        }
+        Ok(folder)
     }
 
     fn unpack(&self, apt: &Apt, folder: &Path) -> Result<(), String> {
@@ -176,20 +225,23 @@ impl Packages {
             apt.command("apt-get")
                 .args(["install", "-qq", "-y", "--download-only", "-o"])
                 .arg(apt::option("Dir::Cache::archives", &archives))
-                .arg(LIBRARY),
+                .arg(self.whole),
         )?;
-        process::run(apt.command("apt-get").args(["download", "-qq"]).args(&self.alone).current_dir(&archives))?;
+        if !self.alone.is_empty() {
+            process::run(apt.command("apt-get").args(["download", "-qq"]).args(&self.alone).current_dir(&archives))?;
+        }
         for file in &self.files {
             let archive = archives.join(file);
             // Of the kernel only what boots: its modules are large and all that is
             // needed is built in.
-            let parts: &[&str] = match file.starts_with("linux-image-") {
-                true => &["./boot/vmlinuz-*", "*/bcm2837-rpi-3-b.dtb"],
-                false => &["./*"],
-            };
+            let mut parts = vec!["./*".to_owned()];
+            if file.starts_with("linux-image-") {
+                parts = vec!["./boot/vmlinuz-*".to_owned()];
+                parts.extend(BOARDS.iter().map(|board| format!("*/{}", board.device_tree)));
+            }
             let words = [archive.to_str(), folder.to_str()];
             let mut words: Vec<&str> = words.into_iter().map(|word| word.expect("it was UTF-8 before")).collect();
-            words.extend(parts);
+            words.extend(parts.iter().map(String::as_str));
             process::pipeline(
                 r#"archive=$1 tree=$2; shift 2
                    dpkg-deb --fsys-tarfile "$archive" | tar -x -C "$tree" --wildcards "$@""#,

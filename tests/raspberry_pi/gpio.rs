@@ -14,13 +14,32 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant};
 
+/// Lines that the emulator drives. The chip of a Raspberry Pi 4 has four more.
 pub const LINES: usize = 54;
 const CHIP: &str = "/machine/soc/peripherals/gpio";
-const SET: u32 = 0x3f20_001c;
-const CLEAR: u32 = 0x3f20_0028;
-const LEVEL: u32 = 0x3f20_0034;
-const START_TIMEOUT: Duration = Duration::from_secs(20);
-const ANSWER_TIMEOUT: Duration = Duration::from_secs(20);
+/// Offsets of registers.
+const SET: u32 = 0x1c;
+const CLEAR: u32 = 0x28;
+const LEVEL: u32 = 0x34;
+/// These are long, because the computer may be busy.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(300);
+
+/// The physical address of the chip's registers.
+#[derive(Clone, Copy)]
+pub struct Registers(pub u32);
+
+impl Registers {
+    fn write_command(self, line: usize, level: bool) -> String {
+        let first = if level { SET } else { CLEAR };
+        format!("writel {:#x} {:#x}", self.of(first, line), 1u32 << (line % 32))
+    }
+
+    /// Each register has 32 lines. The next register has the remaining lines.
+    fn of(self, first: u32, line: usize) -> u32 {
+        self.0 + first + if line < 32 { 0 } else { 4 }
+    }
+}
 
 /// Drives a line after another line has risen this many times.
 #[derive(Clone, Copy)]
@@ -33,11 +52,13 @@ pub struct Trigger {
 
 /// The chip, seen from outside.
 pub struct Gpio {
+    registers: Registers,
     state: Arc<Mutex<State>>,
     answers: Receiver<String>,
 }
 
 struct State {
+    registers: Registers,
     socket: UnixStream,
     /// For each command without an answer yet: whether the answer is needed.
     asked: VecDeque<bool>,
@@ -49,7 +70,7 @@ struct State {
 impl Gpio {
     /// Connects to an emulator that is starting. Its messages must be read all the time, because it waits for the
     /// reader.
-    pub fn connect(path: &Path) -> Result<Gpio, String> {
+    pub fn connect(path: &Path, registers: Registers) -> Result<Gpio, String> {
         let until = Instant::now() + START_TIMEOUT;
         let socket = loop {
             match UnixStream::connect(path) {
@@ -59,19 +80,19 @@ impl Gpio {
             }
         };
         let reader = socket.try_clone().map_err(|error| error.to_string())?;
-        let state = State { socket, asked: VecDeque::new(), edges: vec![Vec::new(); LINES], trigger: None };
+        let state = State { registers, socket, asked: VecDeque::new(), edges: vec![Vec::new(); LINES], trigger: None };
         let state = Arc::new(Mutex::new(state));
         let (sender, answers) = channel();
         let shared = Arc::clone(&state);
         thread::spawn(move || drain(BufReader::new(reader), &shared, &sender));
-        let gpio = Gpio { state, answers };
+        let gpio = Gpio { registers, state, answers };
         gpio.ask(&format!("irq_intercept_out {CHIP}"))?;
         Ok(gpio)
     }
 
     /// The level of a line, whatever drives it.
     pub fn level(&self, line: usize) -> Result<bool, String> {
-        let answer = self.ask(&format!("readl {:#x}", register(LEVEL, line)))?;
+        let answer = self.ask(&format!("readl {:#x}", self.registers.of(LEVEL, line)))?;
         let levels = answer.trim().trim_start_matches("0x");
         let levels = u64::from_str_radix(levels, 16).map_err(|_| format!("qtest read {answer:?}"))?;
         Ok(levels >> (line % 32) & 1 != 0)
@@ -79,7 +100,7 @@ impl Gpio {
 
     /// Drives an input.
     pub fn drive(&self, line: usize, level: bool) -> Result<(), String> {
-        self.ask(&write_command(line, level)).map(drop)
+        self.ask(&self.registers.write_command(line, level)).map(drop)
     }
 
     /// Forgets the edges and the trigger.
@@ -131,7 +152,7 @@ impl State {
         match self.trigger {
             Some(trigger) if level && trigger.watched == line && rises() >= trigger.after => {
                 self.trigger = None;
-                self.send(&write_command(trigger.line, trigger.level), false)
+                self.send(&self.registers.write_command(trigger.line, trigger.level), false)
             }
             _ => Ok(()),
         }
@@ -156,14 +177,4 @@ fn drain(messages: BufReader<UnixStream>, state: &Mutex<State>, answers: &Sender
             return;
         }
     }
-}
-
-fn write_command(line: usize, level: bool) -> String {
-    let first = if level { SET } else { CLEAR };
-    format!("writel {:#x} {:#x}", register(first, line), 1u32 << (line % 32))
-}
-
-/// Each register has 32 lines. The next register has the remaining lines.
-fn register(first: u32, line: usize) -> u32 {
-    if line < 32 { first } else { first + 4 }
 }

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pinion on a Raspberry Pi 3. It runs the tests of `tests/raspberry_pi/guest` against the real driver of the GPIO chip
-//! on an emulated Pi. docs/develop/test-raspberry-pi.md explains its use.
+//! Pinion on a Raspberry Pi 3 and 4. It runs the tests of `tests/raspberry_pi/guest` against the real driver of the GPIO
+//! chip on an emulated Pi. docs/develop/test-raspberry-pi.md explains its use.
 //!
 //! This is the computer's side, a separate test harness. It builds for arm64. It simulates the world outside the pins,
 //! as the tests request over the console.
 
+mod board;
 mod cross;
 mod debian;
 mod gpio;
@@ -13,35 +14,48 @@ mod vm;
 use std::process::ExitCode;
 use std::time::Instant;
 
+use board::{BOARDS, Board};
 use cross::Programs;
-use debian::Sysroot;
+use debian::{Emulator, Sysroot};
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::cache::Cache;
-use vm::{News, Vm};
+use vm::{News, Parts, Vm};
 
 const USAGE: &str = "\
 Usage: cargo test --test raspberry_pi -- [OPTIONS] [FILTERS...]
 
 Runs the tests whose name, as in gpio::an_output_is_seen_from_outside, contains any
-of the filters, on an emulated Raspberry Pi 3. It installs the emulator and compilers
-if they are missing and you are root, and downloads 120 MB the first time.
+of the filters, on each emulated board. It installs compilers if they are missing and
+you are root, and downloads 150 MB the first time.
 
 Options:
   --exact            A filter is a whole name
   --skip FILTER      Leave out the tests whose name contains this
   --nocapture        Show the output of tests that pass, too
-  --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
+  --board BOARD      Only this board: raspi3b or raspi4b
+  --shell            A shell on the board instead of tests; Ctrl-A X ends it";
 
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
 fn main() -> ExitCode {
     let mut shell = false;
-    let arguments = Arguments::read(USAGE, |option, _| {
-        shell |= option == "--shell";
-        Ok(option == "--shell")
+    let mut boards: Vec<&Board> = BOARDS.iter().collect();
+    let arguments = Arguments::read(USAGE, |option, value| {
+        match option {
+            "--shell" => shell = true,
+            "--board" => {
+                let wish = value()?;
+                boards.retain(|board| board.machine == wish);
+                if boards.is_empty() {
+                    return Err(format!("there is no board {wish}"));
+                }
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
     });
-    match run(&arguments, shell) {
+    match run(&arguments, &boards, shell) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(FAILED),
         Err(cause) => {
@@ -51,24 +65,31 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether every test passed. An error is the suite's own failure.
-fn run(arguments: &Arguments, shell: bool) -> Result<bool, String> {
+/// Whether every test passed on each board. An error is the suite's own failure.
+fn run(arguments: &Arguments, boards: &[&'static Board], shell: bool) -> Result<bool, String> {
     let cache = Cache::open()?;
     let sysroot = Sysroot::prepare(&cache)?;
+    let emulator = Emulator::prepare(&cache)?;
     let programs = Programs::build(&sysroot)?;
     let mut archive = programs.initramfs(&sysroot)?;
     let filters: String = arguments.for_libtest().iter().map(|word| format!("{word}\n")).collect();
     archive.file("/tests/filters", filters.as_bytes());
     let initramfs = archive.finish();
-    if shell {
-        vm::shell(&sysroot, &initramfs, &cache)?;
-        return Ok(true);
+    let mut ok = true;
+    // One after the other: each keeps a processor busy.
+    for board in boards {
+        let parts = Parts { board, emulator: &emulator, sysroot: &sysroot, initramfs: &initramfs };
+        if shell {
+            vm::shell(&parts, &cache)?;
+            continue;
+        }
+        println!("a {} with Linux {}", board.name, sysroot.release);
+        let mut vm = Vm::boot(&parts, &cache)?;
+        let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
+        let outcome = follow(&mut vm, &mut report, arguments.show_output);
+        ok &= report.finish(outcome, &vm);
     }
-    println!("a Raspberry Pi 3 with Linux {}", sysroot.release);
-    let mut vm = Vm::boot(&sysroot, &initramfs, &cache)?;
-    let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
-    let outcome = follow(&mut vm, &mut report, arguments.show_output);
-    Ok(report.finish(outcome, &vm))
+    Ok(ok)
 }
 
 /// Runs until the last test has ended. An error describes the end of the VM.

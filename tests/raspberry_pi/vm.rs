@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A Raspberry Pi 3 under QEMU, and the conversation with it over its serial console.
+//! A Raspberry Pi under QEMU, and the conversation with it over its serial console.
 
 use std::fs;
 use std::io::{self, BufRead, BufReader, Write};
@@ -7,17 +7,25 @@ use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use nix::time::ClockId;
+use nix::unistd::Pid;
 use tempfile::TempDir;
 
-use super::debian::{EMULATOR, Sysroot};
+use super::board::Board;
+use super::debian::{Emulator, Sysroot};
 use super::gpio::{Gpio, LINES, Trigger};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::process;
 
-/// Longest silence: more than a test, or a boot on a busy computer, takes.
+/// Longest silence, in processor time of the emulator: more than a boot or a test takes. A busy computer stops this time
+/// and the guest.
 const SILENCE_MAX: Duration = Duration::from_secs(240);
+/// Longest silence by the computer's clock, for an emulator that uses no processor time.
+const STALL_MAX: Duration = Duration::from_secs(3600);
+/// How often the silence is measured.
+const MEASURE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The guest's time: an instruction takes 4 ns. `init.sh` keeps the guest from idling, so nothing else advances the
 /// time. When the computer stops the emulator, the guest's time stops too. By the computer's clock, steps would often
@@ -31,7 +39,7 @@ const MARK: &str = "raspberry-pi: ";
 /// `/dev/mem` may map the registers of the GPIO chip although a driver uses them (`iomem`).
 /// A panic is not followed by silence. Otherwise the kernel prints nothing: its messages would be in the middle of the
 /// tests' messages.
-const COMMAND_LINE: &str = "console=ttyS1,115200 loglevel=1 panic=-1 cryptomgr.notests iomem=relaxed";
+const COMMAND_LINE: &str = "loglevel=1 panic=-1 cryptomgr.notests iomem=relaxed";
 
 /// The progress of the guest.
 pub enum News {
@@ -41,6 +49,39 @@ pub enum News {
     Ended { test: String, status: String, output: String },
     /// The last test has ended.
     Done,
+}
+
+/// What a VM is made of.
+pub struct Parts<'a> {
+    pub board: &'static Board,
+    pub emulator: &'a Emulator,
+    pub sysroot: &'a Sysroot,
+    pub initramfs: &'a [u8],
+}
+
+impl Parts<'_> {
+    /// The common command of all runs, without its console: the second serial port.
+    fn command(&self, folder: &Path, more: &str) -> Result<Command, String> {
+        let root = folder.join("initramfs");
+        fs::write(&root, self.initramfs).map_err(|error| format!("cannot write {}: {error}", root.display()))?;
+        let Board { machine, baud, command_line, chip, lines, .. } = self.board;
+        let mut command = self.emulator.command();
+        command
+            .args(["-M", machine, "-accel", "tcg", "-display", "none", "-no-reboot", "-serial", "null"])
+            .args(TIME)
+            .arg("-kernel")
+            .arg(self.sysroot.kernel())
+            .arg("-dtb")
+            .arg(self.sysroot.device_tree(self.board))
+            .arg("-initrd")
+            .arg(root)
+            .arg("-append")
+            // The kernel hands unknown words to the guest's init, in its environment.
+            .arg(format!(
+                "console=ttyS1,{baud} {COMMAND_LINE} {command_line} GPIO_CHIP={chip} GPIO_LINES={lines} {more}"
+            ));
+        Ok(command)
+    }
 }
 
 /// A running VM. It ends when this is dropped.
@@ -57,10 +98,10 @@ pub struct Vm {
 }
 
 impl Vm {
-    pub fn boot(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<Vm, String> {
+    pub fn boot(parts: &Parts, cache: &Cache) -> Result<Vm, String> {
         let folder = cache.run_folder()?;
         let qtest = folder.path().join("qtest");
-        let mut command = command(sysroot, initramfs, folder.path(), "")?;
+        let mut command = parts.command(folder.path(), "")?;
         command.arg("-qtest").arg(format!("unix:{},server=on,wait=off", qtest.display())).args([
             "-qtest-log",
             "none",
@@ -70,7 +111,7 @@ impl Vm {
             "none",
         ]);
         let (mut qemu, input, output) = process::start_emulator(&mut command, folder.path())?;
-        match Gpio::connect(&qtest) {
+        match Gpio::connect(&qtest, parts.board.registers) {
             Ok(gpio) => Ok(Vm {
                 qemu,
                 gpio,
@@ -92,10 +133,7 @@ impl Vm {
     /// Carries out the guest's requests until there is news. An error describes the end of the VM.
     pub fn next(&mut self) -> Result<News, String> {
         loop {
-            let line = self.lines.recv_timeout(SILENCE_MAX).map_err(|error| match error {
-                RecvTimeoutError::Timeout => format!("nothing came from it for {} s", SILENCE_MAX.as_secs()),
-                RecvTimeoutError::Disconnected => "the VM ended too early".to_owned(),
-            })?;
+            let line = self.line()?;
             self.console += &line;
             self.console.push('\n');
             // A test may have printed text before this without a new line.
@@ -125,6 +163,34 @@ impl Vm {
                 }
             }
         }
+    }
+
+    /// The console's next line.
+    fn line(&self) -> Result<String, String> {
+        let (since, spent) = (Instant::now(), self.processor_time()?);
+        loop {
+            match self.lines.recv_timeout(MEASURE_INTERVAL) {
+                Ok(line) => return Ok(line),
+                Err(RecvTimeoutError::Disconnected) => return Err("the VM ended too early".to_owned()),
+                Err(RecvTimeoutError::Timeout) => {
+                    let silence = self.processor_time()?.saturating_sub(spent);
+                    if silence > SILENCE_MAX || since.elapsed() > STALL_MAX {
+                        return Err(format!(
+                            "nothing came from it for {} s, with {} s of processor time",
+                            since.elapsed().as_secs(),
+                            silence.as_secs()
+                        ));
+                    }
+                }
+            }
+        }
+    }
+
+    /// What the emulator has used.
+    fn processor_time(&self) -> Result<Duration, String> {
+        let process = Pid::from_raw(self.qemu.id().cast_signed());
+        let time = ClockId::pid_cpu_clock_id(process).and_then(ClockId::now);
+        time.map(Duration::from).map_err(|error| format!("the emulator's processor time is unknown: {error}"))
     }
 
     /// The whole output of the guest and the emulator.
@@ -169,32 +235,14 @@ impl Drop for Vm {
 }
 
 /// A shell in the guest, on this terminal.
-pub fn shell(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<(), String> {
+pub fn shell(parts: &Parts, cache: &Cache) -> Result<(), String> {
     let folder = cache.run_folder()?;
-    let mut qemu = command(sysroot, initramfs, folder.path(), "GUEST_SHELL=1")?
+    let mut qemu = parts
+        .command(folder.path(), "GUEST_SHELL=1")?
         .args(["-serial", "mon:stdio"])
         .spawn()
         .map_err(|error| format!("cannot start the emulator: {error}"))?;
     qemu.wait().map(drop).map_err(|error| error.to_string())
-}
-
-/// The common VM of all runs, without its console: the second serial port.
-fn command(sysroot: &Sysroot, initramfs: &[u8], folder: &Path, more: &str) -> Result<Command, String> {
-    let root = folder.join("initramfs");
-    fs::write(&root, initramfs).map_err(|error| format!("cannot write {}: {error}", root.display()))?;
-    let mut command = Command::new(EMULATOR);
-    command
-        .args(["-M", "raspi3b", "-m", "1G", "-accel", "tcg", "-display", "none", "-no-reboot", "-serial", "null"])
-        .args(TIME)
-        .arg("-kernel")
-        .arg(sysroot.kernel())
-        .arg("-dtb")
-        .arg(sysroot.device_tree())
-        .arg("-initrd")
-        .arg(root)
-        .arg("-append")
-        .arg(format!("{COMMAND_LINE} {more}"));
-    Ok(command)
 }
 
 /// The console's lines, read when they arrive.

@@ -30,12 +30,10 @@ pub fn speed_color(mm_per_s: f64) -> Rgb {
 
 /// Draws pieces onto those that are there already.
 pub fn draw(canvas: &mut Canvas, lens: &Lens, pieces: &[Laid]) {
-    // What an earlier print has left is not worth drawing.
-    let first = pieces.iter().rposition(|piece| piece.begins);
-    if first.is_some() {
+    if pieces.first().is_some_and(|piece| piece.begins) {
         canvas.pixmap.fill(tiny_skia::Color::TRANSPARENT);
     }
-    for piece in &pieces[first.unwrap_or(0)..] {
+    for piece in pieces {
         let [from, to] = [piece.from_mm, piece.to_mm].map(|point| point.map(f64::from));
         let light = light(from, to);
         canvas.rod(lens, [from, to], WIDTH_MM, lit(speed_color(piece.mm_per_s.into()), light), 1.0);

@@ -54,7 +54,7 @@ pub fn plus(a: Point, b: Point) -> Point {
 
 impl Lens {
     /// A lens that shows the whole room as large as possible between these pixels: left, top, right and bottom.
-    pub fn new(room: &Room, [left, top, right_end, bottom]: [f64; 4]) -> Lens {
+    pub fn new(room: &Room, area: [f64; 4]) -> Lens {
         let (sin_a, cos_a) = AZIMUTH_DEGREES.to_radians().sin_cos();
         let (sin_e, cos_e) = ELEVATION_DEGREES.to_radians().sin_cos();
         let size = minus(room.max, room.min);
@@ -64,8 +64,13 @@ impl Lens {
         let eye = minus(middle, forward.map(|part| part * distance));
         let (right, up) = ([cos_a, sin_a, 0.0], [-sin_a * sin_e, cos_a * sin_e, cos_e]);
         let nearest = NEAREST * distance;
-        let mut lens = Lens { eye, right, up, forward, nearest, scale: 1.0, offset: [0.0; 2] };
-        let places = room.corners().map(|corner| lens.place(corner));
+        Lens { eye, right, up, forward, nearest, scale: 1.0, offset: [0.0; 2] }.framing(room, area)
+    }
+
+    /// The same eye, with a part of the room as large as possible between these pixels.
+    pub fn framing(&self, part: &Room, [left, top, right_end, bottom]: [f64; 4]) -> Lens {
+        let mut lens = Lens { scale: 1.0, offset: [0.0; 2], ..self.clone() };
+        let places = part.corners().map(|corner| lens.place(corner));
         let end = |axis: usize, pick: fn(f64, f64) -> f64, first: f64| {
             places.iter().map(|place| place[axis]).fold(first, pick)
         };
@@ -82,6 +87,12 @@ impl Lens {
         let from_eye = minus(point, self.eye);
         let scale = self.scale / dot(from_eye, self.forward).max(self.nearest);
         [self.offset[0] + scale * dot(from_eye, self.right), self.offset[1] - scale * dot(from_eye, self.up)]
+    }
+
+    /// The factor and the offset that turn this lens's pixels into those of another lens of the same eye.
+    pub fn to(&self, other: &Lens) -> (f64, [f64; 2]) {
+        let factor = other.scale / self.scale;
+        (factor, [0, 1].map(|axis| other.offset[axis] - factor * self.offset[axis]))
     }
 
     /// Pixels per millimeter at a point.
@@ -121,6 +132,23 @@ mod tests {
         let width = places.iter().map(|place| place[0]).fold(0.0, f64::max)
             - places.iter().map(|place| place[0]).fold(f64::MAX, f64::min);
         assert!((width - 500.0).abs() < 0.01 || (height - 570.0).abs() < 0.01, "{width} {height}");
+    }
+
+    #[test]
+    fn a_nearer_view_is_the_same_picture_only_larger() {
+        let whole = Lens::new(&ROOM, [10.0, 20.0, 510.0, 590.0]);
+        let part = Room { min: [80.0, 90.0, 0.0], max: [120.0, 130.0, 15.0] };
+        let near = whole.framing(&part, [0.0, 0.0, 300.0, 300.0]);
+        let (factor, offset) = whole.to(&near);
+        assert!(factor > 4.0, "{factor}");
+        for point in ROOM.corners() {
+            let (far, near) = (whole.place(point), near.place(point));
+            for axis in [0, 1] {
+                assert!((far[axis] * factor + offset[axis] - near[axis]).abs() < 1e-6, "{far:?} {near:?}");
+            }
+        }
+        let places = part.corners().map(|corner| near.place(corner));
+        assert!(places.iter().flatten().all(|pixel| (-0.01..300.01).contains(pixel)), "{places:?}");
     }
 
     #[test]

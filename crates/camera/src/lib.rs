@@ -5,6 +5,7 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 #![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
+mod focus;
 mod laid;
 mod lens;
 mod machine;
@@ -15,5 +16,5 @@ pub mod scene;
 mod server;
 mod studio;
 
-pub use picture::Picture;
+pub use picture::{Layout, Picture};
 pub use server::{STREAMS_MAX, serve};

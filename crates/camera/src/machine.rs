@@ -41,6 +41,8 @@ const HEAD_TOP_MM: f64 = 62.0;
 /// From the lower ends of a delta's arms to the axis of its nozzle, and how far they are apart.
 const EFFECTOR_MM: f64 = 26.0;
 const ARMS_APART_MM: f64 = 9.0;
+/// The opacity of the head and the gantry in a near view.
+const VEIL: f64 = 0.16;
 /// The color of a heater begins to change here, and is as hot as can be there.
 const WARM_CELSIUS: [f64; 2] = [35.0, 110.0];
 const HOT_CELSIUS: [f64; 2] = [50.0, 250.0];
@@ -114,12 +116,10 @@ impl Printer {
         }
     }
 
-    /// The part of the room that has to be in the picture. Only the head's top and the ends of the posts are outside.
+    /// The part of the room where filament is laid.
     pub fn stage(&self) -> Room {
-        let Room { min, max } = self.room();
-        let [left, right, _, back] = self.bed.ends();
-        let outside_mm = MARGIN_MM * 0.75;
-        solid([left - outside_mm, right + outside_mm], [min[1], back], [min[2], max[2] - HEAD_TOP_MM])
+        let [left, right, front, back] = self.bed.ends();
+        solid([left, right], [front, back], [0.0, self.height_mm])
     }
 
     /// Where the strips of lights are: this part of the way from the left to the right, in one of several rows.
@@ -238,11 +238,21 @@ impl Printer {
         }
     }
 
-    /// Draws what moves, and the posts in front of it.
-    pub fn draw_moving(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene, turns: &[f64]) {
+    /// Draws what moves, and the posts in front of it. In a near view they are a veil, because the head is over the
+    /// part that it prints.
+    pub fn draw_moving(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene, turns: &[f64], is_near: bool) {
+        if !is_near {
+            draw_shadow(canvas, lens, scene.nozzle_mm);
+            return self.draw_solid(canvas, lens, scene, turns);
+        }
+        canvas.opacity = VEIL;
+        self.draw_solid(canvas, lens, scene, turns);
+        canvas.opacity = 1.0;
+        draw_tip(canvas, lens, scene);
+    }
+
+    fn draw_solid(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene, turns: &[f64]) {
         let lost = |name: &str| scene.axes.iter().any(|axis| axis.lost_steps > 0 && axis.name.starts_with(name));
-        let nozzle = scene.nozzle_mm;
-        draw_shadow(canvas, lens, nozzle);
         match self.gantry {
             Gantry::Delta { towers_mm, arm_mm } => {
                 self.draw_delta(canvas, lens, scene, towers_mm, arm_mm, turns);
@@ -350,26 +360,25 @@ impl Printer {
 
     fn draw_head(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene, turns: &[f64]) {
         let [x, y, z] = scene.nozzle_mm;
-        let hot_ends = scene.heaters.iter().filter(|heater| heater.name.starts_with("extruder"));
-        let part = part_of(hot_ends.map(|heater| heater.celsius).fold(0.0, f64::max), HOT_CELSIUS);
         let probes = |behind: bool| scene.probes.iter().filter(move |probe| (probe.offset_mm[1] > 0.0) == behind);
         for probe in probes(true) {
             draw_probe(canvas, lens, scene.nozzle_mm, probe);
         }
         if matches!(self.gantry, Gantry::Delta { .. }) {
-            for step in 0..=6 {
+            // A veil of seven discs would hide what is behind it.
+            let between = if canvas.opacity < 1.0 { 6 } else { 1 };
+            for step in (0..=6).step_by(between) {
                 let ring = circle([x, y, z + GANTRY_MM - 6.0 + f64::from(step)], EFFECTOR_MM + 4.0);
                 canvas.polygon(places(lens, ring), lit(MOTOR, if step == 6 { 1.5 } else { 0.9 }), 1.0);
             }
         }
-        // The nozzle, from its tip to the block.
-        let tip = [[x, y, z], [x + 3.4, y, z + 6.0], [x - 3.4, y, z + 6.0]];
-        if part > 0.0 {
-            canvas.glow(lens.place([x, y, z + 8.0]), 34.0 * lens.scale_at(scene.nozzle_mm), GLOWING, 0.55 * part);
+        let heat = heat(scene);
+        if heat > 0.0 {
+            canvas.glow(lens.place([x, y, z + 8.0]), 34.0 * lens.scale_at(scene.nozzle_mm), GLOWING, 0.55 * heat);
         }
-        canvas.polygon(places(lens, tip), mix(NOZZLE, GLOWING, 0.5 * part), 1.0);
+        draw_tip(canvas, lens, scene);
         let block = solid([x - 10.0, x + 10.0], [y - 8.0, y + 8.0], [z + 6.0, z + 16.0]);
-        canvas.solid(lens, &block, mix(BLOCK, GLOWING, part), 1.0);
+        canvas.solid(lens, &block, mix(BLOCK, GLOWING, heat), 1.0);
         let body = match self.gantry {
             Gantry::Delta { .. } => solid([x - 12.0, x + 12.0], [y - 12.0, y + 12.0], [z + GANTRY_MM, z + HEAD_TOP_MM]),
             Gantry::Cartesian | Gantry::CoreXy => {
@@ -397,6 +406,19 @@ impl Printer {
             draw_probe(canvas, lens, scene.nozzle_mm, probe);
         }
     }
+}
+
+/// How hot the hot ends are, 0 to 1.
+fn heat(scene: &Scene) -> f64 {
+    let hot_ends = scene.heaters.iter().filter(|heater| heater.name.starts_with("extruder"));
+    part_of(hot_ends.map(|heater| heater.celsius).fold(0.0, f64::max), HOT_CELSIUS)
+}
+
+/// The nozzle, from its tip to the block.
+fn draw_tip(canvas: &mut Canvas, lens: &Lens, scene: &Scene) {
+    let [x, y, z] = scene.nozzle_mm;
+    let tip = [[x, y, z], [x + 3.4, y, z + 6.0], [x - 3.4, y, z + 6.0]];
+    canvas.polygon(places(lens, tip), mix(NOZZLE, GLOWING, 0.5 * heat(scene)), 1.0);
 }
 
 /// How far a temperature is from the first to the second, 0 to 1.

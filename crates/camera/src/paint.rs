@@ -3,8 +3,8 @@
 
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{
-    BlendMode, Color, FillRule, GradientStop, LineCap, LinearGradient, Paint, PathBuilder, Pixmap, Point as Pixel,
-    PremultipliedColorU8, RadialGradient, Rect, Shader, SpreadMode, Stroke, Transform,
+    BlendMode, Color, FillRule, FilterQuality, GradientStop, LineCap, LinearGradient, Paint, PathBuilder, Pixmap,
+    PixmapPaint, Point as Pixel, PremultipliedColorU8, RadialGradient, Rect, Shader, SpreadMode, Stroke, Transform,
 };
 
 use crate::lens::{Lens, Point, Room};
@@ -51,6 +51,8 @@ impl Font {
 /// Pixels, and how shapes come onto them.
 pub struct Canvas {
     pub pixmap: Pixmap,
+    /// What is left of the opacity of each shape, 0 to 1. Texts and rectangles keep theirs.
+    pub opacity: f64,
 }
 
 fn paint(color: Rgb, alpha: f64) -> Paint<'static> {
@@ -84,13 +86,19 @@ fn outline(points: impl IntoIterator<Item = [f64; 2]>, close: bool) -> Option<ti
 impl Canvas {
     /// `None` without a pixel.
     pub fn new(width: u32, height: u32) -> Option<Canvas> {
-        Pixmap::new(width, height).map(|pixmap| Canvas { pixmap })
+        Pixmap::new(width, height).map(|pixmap| Canvas { pixmap, opacity: 1.0 })
     }
 
     /// A convex or other outline, filled.
     pub fn polygon(&mut self, points: impl IntoIterator<Item = [f64; 2]>, rgb: Rgb, alpha: f64) {
         if let Some(path) = outline(points, true) {
-            self.pixmap.fill_path(&path, &paint(rgb, alpha), FillRule::Winding, Transform::identity(), None);
+            self.pixmap.fill_path(
+                &path,
+                &paint(rgb, alpha * self.opacity),
+                FillRule::Winding,
+                Transform::identity(),
+                None,
+            );
         }
     }
 
@@ -98,20 +106,27 @@ impl Canvas {
     pub fn line(&mut self, points: impl IntoIterator<Item = [f64; 2]>, width: f64, rgb: Rgb, alpha: f64) {
         if let Some(path) = outline(points, false) {
             let stroke = Stroke { width: width as f32, line_cap: LineCap::Round, ..Stroke::default() };
-            self.pixmap.stroke_path(&path, &paint(rgb, alpha), &stroke, Transform::identity(), None);
+            self.pixmap.stroke_path(&path, &paint(rgb, alpha * self.opacity), &stroke, Transform::identity(), None);
         }
     }
 
     /// A filled circle.
     pub fn circle(&mut self, [x, y]: [f64; 2], radius: f64, rgb: Rgb, alpha: f64) {
         if let Some(path) = PathBuilder::from_circle(x as f32, y as f32, radius as f32) {
-            self.pixmap.fill_path(&path, &paint(rgb, alpha), FillRule::Winding, Transform::identity(), None);
+            self.pixmap.fill_path(
+                &path,
+                &paint(rgb, alpha * self.opacity),
+                FillRule::Winding,
+                Transform::identity(),
+                None,
+            );
         }
     }
 
     /// Light around a place, which fades with the distance.
     pub fn glow(&mut self, place: [f64; 2], radius: f64, rgb: Rgb, alpha: f64) {
-        let stops = vec![GradientStop::new(0.0, color(rgb, alpha)), GradientStop::new(1.0, color(rgb, 0.0))];
+        let stops =
+            vec![GradientStop::new(0.0, color(rgb, alpha * self.opacity)), GradientStop::new(1.0, color(rgb, 0.0))];
         let (middle, radius) = (pixel(place), radius as f32);
         let shader = RadialGradient::new(middle, 0.0, middle, radius, stops, SpreadMode::Pad, Transform::identity());
         let square = Rect::from_xywh(middle.x - radius, middle.y - radius, 2.0 * radius, 2.0 * radius);
@@ -185,6 +200,27 @@ impl Canvas {
                 *below = PremultipliedColorU8::from_rgba(red, green, blue, 255).unwrap_or(*below);
             }
         }
+    }
+
+    /// Replaces everything by another canvas: each of its pixels is `factor` times as large, and then moved by `offset`.
+    /// It leaves nothing without memory for the steps between.
+    pub fn take_scaled(&mut self, other: &Canvas, mut factor: f64, [x, y]: [f64; 2]) {
+        self.pixmap.fill(Color::TRANSPARENT);
+        let smooth = PixmapPaint { quality: FilterQuality::Bilinear, ..PixmapPaint::default() };
+        let scaled = |factor: f64, x: f64, y: f64| {
+            Transform::from_row(factor as f32, 0.0, 0.0, factor as f32, x as f32, y as f32)
+        };
+        // The filter reads four pixels. With a smaller factor, thin walls would fall between them.
+        let mut half: Option<Pixmap> = None;
+        while factor < 0.5 {
+            let from = half.as_ref().unwrap_or(&other.pixmap);
+            let Some(mut next) = Pixmap::new(from.width().div_ceil(2), from.height().div_ceil(2)) else { return };
+            next.draw_pixmap(0, 0, from.as_ref(), &smooth, scaled(0.5, 0.0, 0.0), None);
+            half = Some(next);
+            factor *= 2.0;
+        }
+        let from = half.as_ref().unwrap_or(&other.pixmap);
+        self.pixmap.draw_pixmap(0, 0, from.as_ref(), &smooth, scaled(factor, x, y), None);
     }
 
     /// A text with its left upper corner here. A character that the font does not have is a question mark.

@@ -18,14 +18,20 @@ pub const OUT: Rgb = [90, 240, 120];
 const ROW: f64 = 21.0;
 /// The hottest temperature that a bar shows.
 const FULL_CELSIUS: f64 = 300.0;
+/// The word for an MCU that is shut down.
+const SHUTDOWN: &str = "SHUTDOWN";
 /// Largest picture of a display, in pixels.
 const DISPLAY_MAX: f64 = 256.0;
 
-/// The column of the panel: from its left to its right.
+/// Where the texts are: the column of the cards, and the line with the position.
 pub struct Panel {
     pub left: f64,
+    pub top: f64,
     pub right: f64,
     pub bottom: f64,
+    /// The end of the line with the position, and its lower edge. It begins at the left of the picture.
+    pub line_right: f64,
+    pub line_bottom: f64,
 }
 
 impl Panel {
@@ -33,11 +39,11 @@ impl Panel {
     pub fn pixel(&self, display: &Display, x: usize, y: usize) -> ([f64; 2], f64) {
         let size = (DISPLAY_MAX / display.width.max(1) as f64).floor().max(1.0);
         let left = (self.left + self.right - size * display.width as f64) / 2.0;
-        ([left + size * x as f64, 16.0 + size * y as f64], size)
+        ([left + size * x as f64, self.top + 16.0 + size * y as f64], size)
     }
 
     pub fn draw(&self, canvas: &mut Canvas, scene: &Scene, turns: &[f64]) {
-        let mut y = 8.0;
+        let mut y = self.top + 8.0;
         if let Some(display) = scene.displays.first() {
             y = self.draw_display(canvas, display) + 10.0;
         }
@@ -71,7 +77,7 @@ impl Panel {
 
     fn draw_position(&self, canvas: &mut Canvas, scene: &Scene) {
         let [x, y, z] = scene.nozzle_mm;
-        let mut at = [14.0, self.bottom - 38.0];
+        let mut at = [14.0, self.line_bottom - 38.0];
         let width = 30.0 * Font::Large.advance() + 20.0;
         canvas.card([6.0, at[1] - 5.0, width, 34.0], 6.0, CARD, 0.72);
         for (name, mm, color) in [("X", x, [236, 100, 90]), ("Y", y, [104, 214, 118]), ("Z", z, COLD)] {
@@ -81,8 +87,7 @@ impl Panel {
             at[0] += 8.5 * Font::Large.advance();
         }
         // The colors of the filament.
-        let (left, top) = (width + 24.0, self.bottom - 22.0);
-        let right = self.left - 8.0;
+        let (left, top, right) = (width + 24.0, self.line_bottom - 22.0, self.line_right);
         if right > left + 60.0 {
             canvas.scale([left, top + 8.0, right - left, 6.0], &SPEEDS);
             canvas.text([left, top - 10.0], Font::Small, FAINT, "0");
@@ -94,9 +99,11 @@ impl Panel {
                 &fastest,
             );
         }
+        let stop = scene.is_shut_down.then(|| SHUTDOWN.to_owned());
+        let lost = scene.axes.iter().filter(|axis| axis.lost_steps > 0).take(6);
+        let lost = lost.map(|axis| format!("{}: {} steps lost", axis.name, axis.lost_steps));
         let mut top = 14.0;
-        for axis in scene.axes.iter().filter(|axis| axis.lost_steps > 0).take(6) {
-            let text = format!("{}: {} steps lost", axis.name, axis.lost_steps);
+        for text in stop.into_iter().chain(lost) {
             canvas.card(
                 [8.0, top - 5.0, 20.0 + text.chars().count() as f64 * Font::Large.advance(), 34.0],
                 6.0,
@@ -133,13 +140,12 @@ impl Rows<'_> {
         Some(top)
     }
 
-    fn name(&mut self, y: f64, name: &str) {
-        let text: String = name.chars().take(16).collect();
-        self.canvas.text([self.panel.left + 28.0, y + 2.0], Font::Small, FAINT, &text);
-    }
-
-    fn value(&mut self, y: f64, value: &str, color: Rgb) {
-        let x = self.panel.right - 10.0 - value.chars().count() as f64 * Font::Small.advance();
+    /// A name at the left and a value at the right. A name that is too long is cut off.
+    fn text(&mut self, y: f64, name: &str, value: &str, color: Rgb) {
+        let (left, advance) = (self.panel.left + 28.0, Font::Small.advance());
+        let x = self.panel.right - 10.0 - value.chars().count() as f64 * advance;
+        let name: String = name.chars().take(((x - left) / advance - 1.0).max(0.0) as usize).collect();
+        self.canvas.text([left, y + 2.0], Font::Small, FAINT, &name);
         self.canvas.text([x, y + 2.0], Font::Small, color, value);
     }
 
@@ -151,8 +157,8 @@ impl Rows<'_> {
             let color = mix(COLD, HOT, part * 1.6);
             let left = self.panel.left;
             self.canvas.circle([left + 15.0, y + ROW / 2.0], 5.0, if heater.on { HOT } else { [58, 64, 76] }, 1.0);
-            self.name(y, &heater.name);
-            self.value(y, &format!("{:.1} \u{b0}C", heater.celsius), color);
+            let target = heater.target_celsius.map_or(String::new(), |target| format!(" / {target:.0}"));
+            self.text(y, &heater.name, &format!("{:.1}{target} \u{b0}C", heater.celsius), color);
             let width = self.panel.right - left - 38.0;
             self.canvas.rectangle([left + 28.0, y + ROW - 3.0, width, 2.0], [44, 49, 60], 1.0);
             self.canvas.rectangle([left + 28.0, y + ROW - 3.0, width * part, 2.0], color, 1.0);
@@ -173,8 +179,7 @@ impl Rows<'_> {
                 let color = if fan.rpm >= 1.0 { TEXT } else { FAINT };
                 self.canvas.polygon([[mx, my], at(turn - 0.06, 8.0), at(turn + 0.08, 8.0)], color, 1.0);
             }
-            self.name(y, &fan.name);
-            self.value(y, &format!("{:.0} rpm", fan.rpm), TEXT);
+            self.text(y, &fan.name, &format!("{:.0} rpm", fan.rpm), TEXT);
         }
     }
 
@@ -188,9 +193,8 @@ impl Rows<'_> {
                 self.canvas.glow(place, 16.0, lamp.color, 0.7 * lamp.brightness);
                 self.canvas.circle(place, 5.0, lamp.color, lamp.brightness);
             }
-            self.name(y, &lamp.name);
             let text = if lamp.brightness > 0.0 { format!("{:.0} %", 100.0 * lamp.brightness) } else { "off".into() };
-            self.value(y, &text, TEXT);
+            self.text(y, &lamp.name, &text, TEXT);
         }
     }
 
@@ -204,8 +208,7 @@ impl Rows<'_> {
             let (sin, cos) = servo.degrees.to_radians().sin_cos();
             self.canvas.circle([mx, my], 4.0, [70, 76, 88], 1.0);
             self.canvas.line([[mx, my], [mx - 9.0 * cos, my - 9.0 * sin]], 2.5, TEXT, 1.0);
-            self.name(y, &servo.name);
-            self.value(y, &format!("{:.0}\u{b0}", servo.degrees), TEXT);
+            self.text(y, &servo.name, &format!("{:.0}\u{b0}", servo.degrees), TEXT);
         }
         for ((probe, pin), row) in pins.into_iter().zip(&mut row) {
             let y = top + ROW * f64::from(row);
@@ -215,8 +218,7 @@ impl Rows<'_> {
                 Pin::Alarm => (LOST, "alarm"),
             };
             self.canvas.circle([self.panel.left + 15.0, y + ROW / 2.0], 5.0, color, 1.0);
-            self.name(y, &probe.name);
-            self.value(y, text, TEXT);
+            self.text(y, &probe.name, text, TEXT);
         }
     }
 }

@@ -53,6 +53,8 @@ pub enum Gantry {
 pub struct Scene {
     /// The time, from any instant.
     pub seconds: f64,
+    /// Whether the MCU is shut down.
+    pub is_shut_down: bool,
     /// The position of the nozzle: x, y and z.
     pub nozzle_mm: [f64; 3],
     /// The motors.
@@ -93,6 +95,8 @@ pub struct Heater {
     pub name: String,
     /// Its temperature.
     pub celsius: f64,
+    /// The temperature that the host wants; `None` if that is unknown or none.
+    pub target_celsius: Option<f64>,
     /// Whether it has power.
     pub on: bool,
 }

@@ -7,6 +7,8 @@
 //! | `/snapshot`, `/?action=snapshot` | the picture now, as a JPEG |
 //! | `/` | a page with the picture in motion |
 //!
+//! With `layout=tall` in the query, the texts are below the printer instead of beside it.
+//!
 //! A connection waits for nobody but its own viewer. A slow viewer gets fewer frames. All is bounded: connections,
 //! streams, the size of a request, and the time for each request, answer and frame.
 
@@ -18,7 +20,7 @@ use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use nix::sys::socket::{setsockopt, sockopt};
 
-use crate::picture::Picture;
+use crate::picture::{Layout, Picture};
 use crate::scene::{Printer, Scene};
 use crate::studio::{Frame, Studio};
 
@@ -58,9 +60,12 @@ const PAGE: &str = "<!doctype html>
 <title>Simulated printer</title>
 <style>
 body { margin: 0; background: #0e1014 }
-img { display: block; width: 100%; max-height: 100vh; object-fit: contain }
+img { display: block; width: 100vw; height: 100vh; height: 100dvh; object-fit: contain }
 </style>
-<img src=\"stream\" width=\"736\" height=\"552\" alt=\"The simulated printer\">
+<picture>
+<source media=\"(max-aspect-ratio: 1/1)\" srcset=\"stream?layout=tall\">
+<img src=\"stream\" alt=\"The simulated printer\">
+</picture>
 </html>
 ";
 
@@ -75,7 +80,8 @@ pub fn serve(
     printer: Printer,
     look: impl FnMut() -> Scene + Send + 'static,
 ) -> io::Result<std::convert::Infallible> {
-    let is_local = listener.local_addr()?.ip().is_loopback();
+    // [::ffff:127.0.0.1] is 127.0.0.1.
+    let is_local = listener.local_addr()?.ip().to_canonical().is_loopback();
     let picture = Picture::new(printer).ok_or(io::ErrorKind::OutOfMemory)?;
     let studio = Arc::new(Studio::default());
     let pen = studio.clone();
@@ -193,13 +199,15 @@ impl Connection {
         if !["GET", "HEAD"].contains(&request.method.as_str()) {
             return refuse(NOT_ALLOWED);
         }
-        let action = request.query.split('&').find_map(|part| part.strip_prefix("action="));
+        let asked = |key: &str| request.query.split('&').find_map(|part| part.strip_prefix(key)?.strip_prefix('='));
+        let action = asked("action");
+        let layout = if asked("layout") == Some("tall") { Layout::Tall } else { Layout::Wide };
         match (request.path.as_str(), action) {
             ("/stream", _) | ("/", Some("stream")) => match self.streams.take() {
                 None => refuse(TOO_MANY),
-                Some(_place) => self.stream(head_only, &reader),
+                Some(_place) => self.stream(layout, head_only, &reader),
             },
-            ("/snapshot", _) | ("/", Some("snapshot")) => match self.studio.next(None) {
+            ("/snapshot", _) | ("/", Some("snapshot")) => match self.studio.next(layout, None) {
                 None => refuse(NO_FRAME),
                 Some(frame) => {
                     self.send("200 OK", &format!("{reader}{NO_CACHE}"), "image/jpeg", &frame.jpeg, head_only)
@@ -227,7 +235,7 @@ impl Connection {
     }
 
     /// Frame after frame, until the viewer goes.
-    fn stream(&self, head_only: bool, reader: &str) -> io::Result<()> {
+    fn stream(&self, layout: Layout, head_only: bool, reader: &str) -> io::Result<()> {
         let head = format!(
             "HTTP/1.1 200 OK\r\nConnection: close\r\n{reader}{NO_CACHE}Content-Type: multipart/x-mixed-replace;boundary={BOUNDARY}\r\n\r\n"
         );
@@ -237,7 +245,7 @@ impl Connection {
         }
         self.write(format!("--{BOUNDARY}\r\n").as_bytes())?;
         let mut last: Option<Arc<Frame>> = None;
-        while let Some(frame) = self.studio.next(last.as_deref()) {
+        while let Some(frame) = self.studio.next(layout, last.as_deref()) {
             let time = frame.time.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
             let length = frame.jpeg.len();
             let head =

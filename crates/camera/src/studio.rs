@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Frames on demand. One thread draws, and only while somebody waits for a frame. Everybody who waits gets the same one.
+//! Frames on demand. One thread draws, and only while somebody waits for a frame. Everybody who waits for a layout gets
+//! the same frame.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::picture::Picture;
+use crate::picture::{Layout, Picture};
 use crate::scene::Scene;
 
 /// Time from a frame to the next: 15 frames a second.
@@ -25,11 +26,32 @@ pub struct Frame {
     pub jpeg: Vec<u8>,
 }
 
+/// The frames of a layout.
 #[derive(Default)]
-struct State {
+struct Reel {
     last: Option<Arc<Frame>>,
     /// Whether somebody waits for the next frame.
     is_wanted: bool,
+}
+
+impl Reel {
+    fn is_after(&self, number: u64) -> bool {
+        self.last.as_ref().is_some_and(|newest| newest.number > number)
+    }
+}
+
+#[derive(Default)]
+struct State {
+    /// Indexed by the layout.
+    reels: [Reel; 2],
+    /// When the last frame was drawn.
+    drawn: Option<Instant>,
+}
+
+impl State {
+    fn is_wanted(&self) -> bool {
+        self.reels.iter().any(|reel| reel.is_wanted)
+    }
 }
 
 /// Where viewers wait for frames.
@@ -46,43 +68,52 @@ impl Studio {
     }
 
     /// The first frame after `last`. Without `last` it is the newest one, unless that is old. `None` if no frame comes.
-    pub fn next(&self, last: Option<&Frame>) -> Option<Arc<Frame>> {
+    pub fn next(&self, layout: Layout, last: Option<&Frame>) -> Option<Arc<Frame>> {
         let mut state = self.state();
-        let after = match (last, &state.last) {
+        let reel = &mut state.reels[layout as usize];
+        let after = match (last, &reel.last) {
             (Some(last), _) => last.number,
             (None, Some(newest)) if newest.drawn.elapsed() > PERIOD => newest.number,
             (None, _) => 0,
         };
-        let is_old = |state: &State| state.last.as_ref().is_none_or(|newest| newest.number <= after);
-        if is_old(&state) {
-            state.is_wanted = true;
+        if !reel.is_after(after) {
+            reel.is_wanted = true;
             self.wanted.notify_one();
         }
-        let waited = self.drawn.wait_timeout_while(state, WAIT_MAX, |state| is_old(state));
+        let is_old = |state: &mut State| !state.reels[layout as usize].is_after(after);
+        let waited = self.drawn.wait_timeout_while(state, WAIT_MAX, is_old);
         let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
-        state.last.clone().filter(|newest| newest.number > after)
+        state.reels[layout as usize].last.clone().filter(|newest| newest.number > after)
     }
 
     /// Draws each frame that somebody waits for. `look` tells what there is to draw.
     pub fn draw(&self, mut picture: Picture, mut look: impl FnMut() -> Scene) {
         for number in 1.. {
             let next = loop {
-                let waited = self.wanted.wait_timeout_while(self.state(), LAYING_PERIOD, |state| !state.is_wanted);
+                let waited = self.wanted.wait_timeout_while(self.state(), LAYING_PERIOD, |state| !state.is_wanted());
                 let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
-                if state.is_wanted {
-                    break state.last.as_ref().map(|last| last.drawn + PERIOD);
+                if state.is_wanted() {
+                    break state.drawn.map(|drawn| drawn + PERIOD);
                 }
                 drop(state);
-                picture.lay(&look());
+                picture.take(&look());
             };
             if let Some(wait) = next.and_then(|next| next.checked_duration_since(Instant::now())) {
                 thread::sleep(wait);
             }
-            self.state().is_wanted = false;
             let (drawn, time) = (Instant::now(), SystemTime::now());
-            picture.draw(&look());
-            let frame = Frame { number, drawn, time, jpeg: picture.jpeg() };
-            self.state().last = Some(Arc::new(frame));
+            let wanted = {
+                let mut state = self.state();
+                state.drawn = Some(drawn);
+                Layout::ALL.map(|layout| std::mem::take(&mut state.reels[layout as usize].is_wanted))
+            };
+            let scene = look();
+            picture.take(&scene);
+            for layout in Layout::ALL.into_iter().filter(|layout| wanted[*layout as usize]) {
+                picture.draw(&scene, layout);
+                let frame = Frame { number, drawn, time, jpeg: picture.jpeg(layout) };
+                self.state().reels[layout as usize].last = Some(Arc::new(frame));
+            }
             self.drawn.notify_all();
         }
     }

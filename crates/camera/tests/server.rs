@@ -155,6 +155,33 @@ fn a_snapshot_is_a_jpeg_and_the_next_one_is_newer() {
     assert!(head.starts_with("HTTP/1.1 200 OK\r\n") && body.is_empty(), "{head}");
 }
 
+/// The width and the height of a JPEG, from its start of frame.
+fn size(jpeg: &[u8]) -> [u16; 2] {
+    let start = jpeg.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
+    [7, 5].map(|at| u16::from_be_bytes([jpeg[start + at], jpeg[start + at + 1]]))
+}
+
+#[test]
+fn a_viewer_with_a_narrow_window_gets_a_tall_picture() {
+    let camera = Camera::start();
+    let is_tall = |jpeg: &[u8]| size(jpeg)[1] > size(jpeg)[0];
+    for (target, tall) in [
+        ("/snapshot", false),
+        ("/snapshot?layout=tall", true),
+        ("/?action=snapshot&layout=tall", true),
+        ("/snapshot?layout=wide", false),
+    ] {
+        assert_eq!(is_tall(&camera.get(target).1), tall, "{target}");
+    }
+    // Both at the same time.
+    let mut wide = camera.watch();
+    let mut tall = Viewer { stream: camera.sent(&get("/stream?layout=tall")), bytes: Vec::new() };
+    tall.until("\r\n\r\n");
+    for _ in 0..3 {
+        assert!(!is_tall(&wide.frame()) && is_tall(&tall.frame()));
+    }
+}
+
 #[test]
 fn a_stream_has_frame_after_frame() {
     let camera = Camera::start();

@@ -127,7 +127,7 @@ impl SimBoard {
             let bus = SpiBus::new(bus, |name| {
                 let (pin, lamp) = switched.iter().find(|(pin, _)| pin.name == name)?;
                 Some((lamp.clone(), pin.inverted))
-            })?;
+            });
             workshop.spi_buses.push(bus);
         }
         for part in &config.parts {
@@ -153,7 +153,12 @@ impl SimBoard {
 
     /// A view of the printer for demonstrations, drawings and tests.
     pub fn probe(&self) -> SimProbe {
-        SimProbe { world: self.world.clone(), bed: self.bed.clone(), clock: self.clock.clone() }
+        SimProbe {
+            world: self.world.clone(),
+            bed: self.bed.clone(),
+            spi_buses: self.spi_buses.clone(),
+            clock: self.clock.clone(),
+        }
     }
 
     /// The time of the MCU that drives the printer.

@@ -3,9 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
-use std::path::Path;
-
 use serde::Deserialize;
 
 use super::catalog::PartConfig;
@@ -65,6 +62,9 @@ pub struct SimConfig {
     pub parts: Vec<PartConfig>,
 }
 
+/// Highest number of parts. Each is compared with each.
+const PARTS_MAX: usize = 1000;
+
 /// The default printer's description. A test makes sure that it is valid.
 const DEFAULT: &str = include_str!("default.toml");
 
@@ -80,16 +80,6 @@ impl SimConfig {
             Ok(config) => config,
             Err(error) => unreachable!("{error}"),
         }
-    }
-
-    /// Reads a description from a file.
-    pub fn load(path: &Path) -> Result<SimConfig, Trouble> {
-        let file = path.display();
-        let text = fs::read_to_string(path).map_err(|error| {
-            let trouble = Trouble::new(error.to_string()).of(&file);
-            trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
-        })?;
-        SimConfig::parse(&text, &file.to_string())
     }
 
     /// Reads a description; `origin` is its name in an error.
@@ -140,6 +130,10 @@ impl SimConfig {
         let printer = self.printer();
         let mut pins = UsedPins::default();
         printer.validate(&mut pins)?;
+        if self.parts.len() > PARTS_MAX {
+            let trouble = Trouble::new(format!("there are {} parts", self.parts.len()));
+            return Err(trouble.remedy(format!("{PARTS_MAX} at most")));
+        }
         self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &printer, &mut pins))
     }
 

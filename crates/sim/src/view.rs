@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::fs::File;
 use std::sync::Arc;
 
 use super::engine::bed::{Bed, Space};
@@ -10,6 +11,7 @@ use super::engine::look::Look;
 use super::engine::physics::Axis;
 use super::engine::recorder::Recorder;
 use super::engine::ring::RingWatch;
+use super::engine::spi::SpiBus;
 use super::engine::world::World;
 use pinion_firmware::time::{Clock, TimeSource};
 
@@ -18,6 +20,7 @@ use pinion_firmware::time::{Clock, TimeSource};
 pub struct SimProbe {
     pub(super) world: Arc<World>,
     pub(super) bed: Arc<Bed>,
+    pub(super) spi_buses: Vec<Arc<SpiBus>>,
     pub(super) clock: Arc<dyn TimeSource>,
 }
 
@@ -72,6 +75,13 @@ pub struct OutputView<'a> {
 }
 
 impl SimProbe {
+    /// Writes a line for each SPI transfer into this file from now on: the bus, the selected chips, the bytes in both
+    /// directions, and the levels of the bus's `trace_pins` at each byte.
+    pub fn record_spi(&self, file: File) {
+        let file = Arc::new(file);
+        self.spi_buses.iter().for_each(|bus| bus.record_to(file.clone()));
+    }
+
     /// The present instant of the printer's clock.
     pub fn now(&self) -> Clock {
         self.clock.now()

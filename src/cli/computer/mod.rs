@@ -4,6 +4,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::env;
 use std::fs;
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
@@ -13,10 +14,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use glob::{MatchOptions, Pattern};
-use nix::unistd::{User, getegid, geteuid, getgroups};
+use nix::unistd::{User, getegid, geteuid, getgroups, getuid};
 
 use crate::foreign;
+use crate::klippy::process::Ids;
 
+pub(super) mod device;
 pub(super) mod manager;
 pub(super) mod running;
 pub(super) mod units;
@@ -35,6 +38,8 @@ const LIKE_A_SHELL: MatchOptions =
 /// The computer that the program looks at.
 pub(in crate::cli) struct Computer {
     root: PathBuf,
+    /// The user that has called this program.
+    caller: Option<u32>,
 }
 
 /// A user, with all groups.
@@ -62,21 +67,20 @@ impl Access {
 }
 
 impl Who {
-    /// Whether the file's owner and mode let this user in (path_resolution(7)).
+    /// Whether the file's owner and mode let this user in.
     pub(in crate::cli) fn may(&self, access: Access, file: &fs::Metadata) -> bool {
-        let bits = match () {
-            () if self.uid == 0 => return true,
-            () if file.uid() == self.uid => file.mode() >> 6,
-            () if self.gids.contains(&file.gid()) => file.mode() >> 3,
-            () => file.mode(),
-        };
-        bits & access.0 == access.0
+        let ids = Ids { uids: vec![self.uid; 2], gids: self.gids.clone() };
+        ids.may(access.0, (file.uid(), file.gid(), file.mode()))
     }
 }
 
 impl Computer {
     pub(in crate::cli) fn at(root: &Path) -> Computer {
-        Computer { root: root.to_owned() }
+        // The user behind sudo. Only root's word counts: anybody else may set the variable to anything.
+        let behind_root = || env::var("SUDO_UID").ok()?.parse().ok();
+        let user = getuid();
+        let caller = if user.is_root() { behind_root() } else { Some(user.as_raw()) };
+        Computer { root: root.to_owned(), caller }
     }
 
     /// True for the live system (root is `/`). Its kernel can be asked more than its files tell.
@@ -262,7 +266,12 @@ pub(super) mod tests {
         }
 
         pub(in crate::cli) fn computer(&self) -> Computer {
-            Computer::at(self.0.path())
+            Computer { root: self.0.path().to_owned(), caller: None }
+        }
+
+        /// The same for a program that this user has called.
+        pub(in crate::cli) fn called_by(&self, uid: u32) -> Computer {
+            Computer { caller: Some(uid), ..self.computer() }
         }
 
         pub(in crate::cli) fn put(&self, path: &str, text: &str) {
@@ -315,6 +324,7 @@ pub(super) mod tests {
             let ids = [uid; 4].map(|uid| uid.to_string()).join("\t");
             let status = format!("Name:\tx\nUid:\t{ids}\nGid:\t{ids}\nGroups:\t{}\n", gids.join(" "));
             self.put(&format!("proc/{pid}/status"), &status);
+            self.put(&format!("proc/{pid}/exe"), "");
         }
     }
 

@@ -3,13 +3,15 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::OsString;
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 
 use crate::cli::settings::{BoardName, Settings};
 use crate::cli::{config, run_args};
+use crate::foreign::word;
 use crate::klippy::HOST_PATHS;
-use crate::klippy::process::{self, Process, Search};
-use crate::proc::status_field;
+use crate::klippy::process::{self, Ids, Process, Search};
 use crate::runtime::helpers;
 
 use super::units::{self, setting};
@@ -26,70 +28,128 @@ pub(in crate::cli) struct Running {
     pub(in crate::cli) settings: Option<Settings>,
 }
 
+/// Who started a process. Any user can have a process with any command line. So the findings and their remedies are
+/// only about the processes of a service, of root and of the caller.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(in crate::cli) enum Starter {
+    /// This unit of the system, without `.service`. It starts a Pinion or a klippy.
+    Unit(String),
+    /// Root, or the user that has called this program.
+    Administrator,
+    /// Anybody else.
+    Stranger,
+}
+
+impl Starter {
+    pub(in crate::cli) fn unit(self) -> Option<String> {
+        match self {
+            Starter::Unit(unit) => Some(unit),
+            Starter::Administrator | Starter::Stranger => None,
+        }
+    }
+}
+
 impl Computer {
     /// The user of a process, with the process's groups. A process has the groups of the time when it was started.
     pub(in crate::cli) fn user_of(&self, pid: u32) -> Option<Who> {
-        let status = self.text(format!("/proc/{pid}/status"))?;
-        let numbers = |field: &str| -> Vec<u32> {
-            let numbers = status_field(&status, field).unwrap_or_default().split_whitespace();
-            numbers.filter_map(|number| number.parse().ok()).collect()
-        };
-        // The second number is the effective one.
-        let uid = *numbers("Uid").get(1)?;
-        let gids = numbers("Gid").get(1).copied().into_iter().chain(numbers("Groups")).collect();
-        Some(Who { name: self.user_name(uid), uid, gids })
+        let ids = self.ids_of(pid)?;
+        Some(Who { name: self.user_name(ids.user()), uid: ids.user(), gids: ids.gids })
     }
 
-    /// The processes, in the order in which they were started.
-    pub(in crate::cli) fn processes(&self) -> Vec<Process> {
+    fn ids_of(&self, pid: u32) -> Option<Ids> {
+        Ids::of(&self.text(format!("/proc/{pid}/status"))?)
+    }
+
+    /// All processes, in the order in which they were started.
+    pub(in crate::cli) fn all_processes(&self) -> Vec<Process> {
         let mut processes = process::all(&self.path("/proc")).unwrap_or_default();
         processes.sort_by_key(|process| (process.started, process.pid));
         processes
     }
 
-    /// The running Pinions, without their helpers.
-    pub(in crate::cli) fn running(&self) -> Vec<Running> {
-        let running = |process: Process| {
-            let program = process.arguments.first()?;
-            let pid = process.pid;
-            let is_helper = |name: String| helpers::NAMES.iter().any(|helper| name.as_bytes() == helper.to_bytes());
-            if program.file_name()? != "pinion" || self.text(format!("/proc/{pid}/comm")).is_some_and(is_helper) {
-                return None;
-            }
-            let arguments = process.arguments.iter().map(|argument| argument.clone().into_os_string());
-            let settings = match run_args(arguments) {
-                Ok(args) => {
-                    let (given, file) = args?.into_parts();
-                    let file = file.map_or_else(
-                        || Ok(Default::default()),
-                        |file| config::load_foreign(&self.path(&file), &file.to_string_lossy()),
-                    );
-                    file.ok().map(|file| given.or(file).settings())
-                }
-                // This is another version of Pinion.
-                Err(_) => None,
-            };
-            let words: Vec<_> = process.arguments.iter().map(|word| word.to_string_lossy()).collect();
-            let config = named_config(words.iter().map(AsRef::as_ref));
-            Some(Running { pid, unit: self.unit_of(pid), config, settings })
-        };
-        self.processes().into_iter().filter_map(running).collect()
+    /// The processes like this that no stranger has started, each with its unit.
+    pub(in crate::cli) fn processes(
+        &self,
+        is_wanted: impl Fn(&Process) -> bool,
+    ) -> impl Iterator<Item = (Process, Option<String>)> {
+        self.all_processes().into_iter().filter(is_wanted).filter_map(|process| match self.starter_of(process.pid) {
+            Starter::Stranger => None,
+            starter => Some((process, starter.unit())),
+        })
     }
 
-    /// The unit that started a process of ours or klippy's, without `.service`. It is the unit of its control group
-    /// (systemd.resource-control(5)). `None` if the process was started from a user's session or manager, which
-    /// `sudo systemctl` does not reach. `None` also if another service's program started it, such as cron.
-    pub(in crate::cli) fn unit_of(&self, pid: u32) -> Option<String> {
-        let groups = self.text(format!("/proc/{pid}/cgroup"))?;
-        let unit = process::unit(&groups)?;
-        // The folders of units may not have the unit, such as an instance of a template. Then its name counts.
-        let text = units::text(self, unit).unwrap_or_default();
-        let starts_it = setting(&text, "ExecStart").is_none_or(|command| {
-            let command = command.to_lowercase();
-            ["pinion", "klippy", "klipper"].iter().any(|program| command.contains(program))
-        });
-        starts_it.then(|| unit.to_owned())
+    /// The running Pinions that no stranger has started, without their helpers.
+    pub(in crate::cli) fn running(&self) -> Vec<Running> {
+        let pinions = self.processes(|process| self.is_pinion(process));
+        pinions.map(|(process, unit)| self.pinion(&process, unit)).collect()
     }
+
+    /// The processes of strangers that are called like a Pinion or a klippy.
+    pub(in crate::cli) fn strangers(&self) -> Vec<Process> {
+        let mut processes = self.all_processes();
+        processes.retain(|process| self.is_pinion(process) || process.is_klippy());
+        processes.retain(|process| self.starter_of(process.pid) == Starter::Stranger);
+        processes
+    }
+
+    /// Whether a process is called like a Pinion that serves hosts, and is none of its helpers.
+    fn is_pinion(&self, process: &Process) -> bool {
+        let is_helper = |name: String| helpers::NAMES.iter().any(|helper| name.as_bytes() == helper.to_bytes());
+        process.program().is_some_and(|program| program == "pinion")
+            && !self.text(format!("/proc/{}/comm", process.pid)).is_some_and(is_helper)
+            // Another version's command line is not understood.
+            && run_args(words(process)).map_or(true, |args| args.is_some())
+    }
+
+    /// A Pinion that is this process.
+    fn pinion(&self, process: &Process, unit: Option<String>) -> Running {
+        let settings = run_args(words(process)).ok().flatten().and_then(|args| {
+            let (given, file) = args.into_parts();
+            let file = file.map_or_else(
+                || Ok(Default::default()),
+                |file| config::load_foreign(&self.path(&file), &file.to_string_lossy()),
+            );
+            file.ok().map(|file| given.or(file).settings())
+        });
+        let words: Vec<_> = process.arguments.iter().map(|word| word.to_string_lossy()).collect();
+        let config = named_config(words.iter().map(AsRef::as_ref));
+        Running { pid: process.pid, unit, config, settings }
+    }
+
+    /// Who started a process.
+    pub(in crate::cli) fn starter_of(&self, pid: u32) -> Starter {
+        let groups = self.text(format!("/proc/{pid}/cgroup")).unwrap_or_default();
+        let unit = process::unit(&groups);
+        if let Some(unit) = unit.filter(|unit| self.starts_hosts(unit)) {
+            return Starter::Unit(unit.to_owned());
+        }
+        let Some(Ids { uids, .. }) = self.ids_of(pid) else { return Starter::Stranger };
+        // A program with the set-user-ID bit keeps its caller's user in one of them, at least at first.
+        let is_wholly = |user: u32| uids.iter().all(|uid| *uid == user);
+        // Such a program may then become root wholly, with a command line of its caller's choice. Only root may look at
+        // another user's program. For others the process has to be a service's.
+        let program = fs::metadata(self.path(format!("/proc/{pid}/exe")));
+        let is_root_s = || program.map_or(unit.is_some(), |program| program.mode() & 0o6000 == 0);
+        match self.caller {
+            Some(caller) if caller != 0 && is_wholly(caller) => Starter::Administrator,
+            _ if is_wholly(0) && is_root_s() => Starter::Administrator,
+            _ => Starter::Stranger,
+        }
+    }
+
+    /// Whether a unit starts Pinion or klippy, so that a restart of the unit starts them anew. Any user may have
+    /// processes in other units, such as cron's.
+    fn starts_hosts(&self, unit: &str) -> bool {
+        // systemd makes some units without a file in these folders, from scripts of System V. Then the name counts.
+        let text = units::text(self, unit).or_else(|| units::text(self, &units::template(unit)?));
+        let command = text.and_then(|text| setting(&text, "ExecStart").map(str::to_lowercase));
+        let command = command.unwrap_or_else(|| unit.split('@').next().unwrap_or_default().to_lowercase());
+        ["pinion", "klippy", "klipper"].iter().any(|program| command.contains(program))
+    }
+}
+
+fn words(process: &Process) -> impl Iterator<Item = OsString> {
+    process.arguments.iter().map(|argument| argument.clone().into_os_string())
 }
 
 /// The configuration file that a command line of any version of Pinion names.
@@ -109,7 +169,17 @@ pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>)
 pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
     let proc = computer.path("/proc");
     let is_simulated = |pinion: &Running| matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)));
-    computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
+    let of_others = || {
+        let pinions = computer.strangers().into_iter().filter(|process| computer.is_pinion(process));
+        let mut pinions = pinions.map(|process| computer.pinion(&process, None)).filter(|pinion| !is_simulated(pinion));
+        pinions.next().map(|pinion| {
+            format!(
+                "a host may print through process {}, a Pinion of another user, and measuring keeps every processor busy, which makes steps late: measure when that process has ended",
+                pinion.pid
+            )
+        })
+    };
+    let at_risk = computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
         let who = match &pinion.unit {
             Some(unit) => format!("Pinion (process {}, {unit})", pinion.pid),
             None => format!("Pinion (process {})", pinion.pid),
@@ -138,27 +208,32 @@ pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
             }
         };
         let name = if host.is_klippy() { "klippy" } else { "a host" };
-        let stop = match computer.unit_of(host.pid).filter(|_| host.is_klippy()) {
-            Some(unit) => format!("sudo systemctl stop {unit}"),
+        let stop = match computer.starter_of(host.pid).unit().filter(|_| host.is_klippy()) {
+            Some(unit) => format!("sudo systemctl stop {}", word(unit)),
             None => format!("end process {}", host.pid),
         };
         Some(format!(
             "{name} (process {}) {is} attached to {who}, and measuring keeps every processor busy, which makes steps late: wait until the print is done, then {stop}; pinion doctor measures gently meanwhile",
             host.pid
         ))
-    })
+    });
+    at_risk.or_else(of_others)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use crate::cli::computer::tests::Tree;
+
+    const MALLORY: u32 = 54_321;
 
     #[test]
     fn the_unit_of_a_process_is_the_one_that_starts_it_again() {
         let tree = Tree::new();
+        tree.process(7, &["pinion"], MALLORY, &[]);
         let unit = |group: &str| {
             tree.put("proc/7/cgroup", &format!("0::{group}\n"));
-            tree.computer().unit_of(7)
+            tree.computer().starter_of(7).unit()
         };
         assert_eq!(unit("/system.slice/system-pinion.slice/pinion-mcu@b.service").as_deref(), Some("pinion-mcu@b"));
         assert_eq!(unit("/user.slice/user-1000.slice/session-2.scope"), None);
@@ -171,5 +246,55 @@ mod tests {
         assert_eq!(unit("/system.slice/klipper.service").as_deref(), Some("klipper"));
         tree.put("etc/systemd/system/mine.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
         assert_eq!(unit("/system.slice/mine.service").as_deref(), Some("mine"));
+        // Its text is the template's.
+        tree.put("lib/systemd/system/sshd@.service", "[Service]\nExecStart=-/usr/sbin/sshd -i\n");
+        assert_eq!(unit("/system.slice/system-sshd.slice/sshd@1-klipper:22.service"), None);
+        assert_eq!(unit("/system.slice/atd.service"), None, "a unit without a file, and of another name");
+        assert_eq!(unit("/system.slice/x@klipper.service"), None, "others may choose the name of an instance");
+        assert_eq!(unit("/printer.slice/klipper.service/worker").as_deref(), Some("klipper"), "a slice of the system");
+    }
+
+    #[test]
+    fn a_group_that_a_user_or_a_container_has_made_is_no_unit() {
+        let tree = Tree::new();
+        tree.process(7, &["pinion"], MALLORY, &[]);
+        for groups in [
+            "0::/user.slice/user-1000.slice/user@1000.service/app.slice/system.slice/klipper.service\n",
+            "0::/user.slice/user-1000.slice/user@1000.service/klipper.service\n",
+            "0::/user.slice/klipper.service\n",
+            // Groups that others than systemd have made, in containers and in other hierarchies.
+            "0::/machine.slice/systemd-nspawn@a.service/payload/system.slice/klipper.service\n",
+            "0::/machine.slice/klipper.service\n",
+            "0::/docker/0123/system.slice/klipper.service\n",
+            "0::/system.slice/docker-0123.scope/system.slice/klipper.service\n",
+            "0::/../system.slice/klipper.service\n",
+            "5:name=lxc:/system.slice/klipper.service\n1:name=systemd:/user.slice/user-1000.slice/session-1.scope\n0::/\n",
+            "3:freezer:/klipper.service\n",
+            "0::/system.slice/.service\n",
+            "0::/system.slice/session.scope/klipper.service\n",
+        ] {
+            tree.put("proc/7/cgroup", groups);
+            assert_eq!(tree.computer().starter_of(7), Starter::Stranger, "{groups}");
+        }
+        tree.put("proc/7/cgroup", "4:pids:/\n1:name=systemd:/system.slice/klipper.service\n0::/\n");
+        assert_eq!(tree.computer().starter_of(7), Starter::Unit("klipper".into()));
+    }
+
+    #[test]
+    fn a_program_with_the_set_user_id_bit_is_its_caller_s() {
+        let tree = Tree::new();
+        tree.put("proc/7/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
+        let starter = |uids: &str, mode: u32| {
+            tree.process(7, &["pinion"], 0, &[]);
+            tree.put("proc/7/status", &format!("Uid:\t{uids}\nGid:\t0\t0\t0\t0\nGroups:\t\n"));
+            tree.mode("proc/7/exe", mode);
+            tree.computer().starter_of(7)
+        };
+        assert_eq!(starter("0\t0\t0\t0", 0o755), Starter::Administrator);
+        // As su and passwd are while they ask for a password.
+        assert_eq!(starter("54321\t0\t0\t0", 0o755), Starter::Stranger);
+        assert_eq!(starter("54321\t54321\t54321\t54321", 0o755), Starter::Stranger);
+        // As sudo is.
+        assert_eq!(starter("0\t0\t0\t0", 0o4755), Starter::Stranger);
     }
 }

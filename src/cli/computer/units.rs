@@ -19,8 +19,12 @@ const ENDING: &str = ".service";
 
 /// Whether a unit is installed and not masked. An instance of a template is installed if the template is.
 pub(in crate::cli) fn is_installed(computer: &Computer, unit: &str) -> bool {
-    let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
-    file(computer, unit).or_else(|| file(computer, &template?)).is_some()
+    file(computer, unit).or_else(|| file(computer, &template(unit)?)).is_some()
+}
+
+/// The template of an instance.
+pub(in crate::cli) fn template(unit: &str) -> Option<String> {
+    unit.split_once('@').map(|(name, _)| format!("{name}@"))
 }
 
 /// The file of a unit that is not masked.

@@ -6,13 +6,15 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::cli::computer::device::Port;
 use crate::cli::computer::{Access, Computer, Who, output};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
+use crate::foreign::word;
 use crate::throttled;
 use pinion_linux::Inventory;
 use pinion_linux::gpio::{Chip, FastGpio, LINK_REMEDY, never_sleeps};
@@ -125,7 +127,7 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
         [] => "log in anew, and start Pinion anew".to_owned(),
-        units => format!("sudo systemctl restart {}", units.join(" ")),
+        units => format!("sudo systemctl restart {}", units.iter().map(word).collect::<Vec<_>>().join(" ")),
     };
     let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
@@ -137,7 +139,11 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
         enabled_by: None,
         nodes: "/dev",
     };
-    let ports: Vec<PathBuf> = ports.iter().map(|port| computer.path(format!("/dev/{port}"))).collect();
+    let there = ports.iter().filter_map(|name| match computer.port(name) {
+        Port::There(port) => Some(computer.path(format!("/dev/{port}"))),
+        Port::Missing | Port::Other => None,
+    });
+    let ports: Vec<PathBuf> = there.collect();
     findings.extend(self::permission(computer, user, &anew, &SERIAL, &ports));
     if instances.iter().any(|instance| instance.settings.watchdog) {
         const WATCHDOG: Class = Class {
@@ -188,7 +194,7 @@ fn permission(computer: &Computer, user: &Who, anew: &str, class: &Class, nodes:
     );
     let group = computer.common_group(about).filter(|_| class.access.is_given_to_group(about));
     let remedy = if let Some(group) = group {
-        format!("sudo usermod -aG {group} {who}, then {anew}")
+        format!("sudo usermod -aG {} {}, then {anew}", word(group), word(who))
     } else if rules_are_there(computer) {
         format!(
             "sudo udevadm control --reload && sudo udevadm trigger --action=add --subsystem-match={}",
@@ -223,7 +229,8 @@ fn present(computer: &Computer, class: &Class) -> Finding {
         let node = computer.name(node);
         let (shown, subsystem) = (node.display(), class.subsystem);
         let found = format!("{name}: {shown} is no {subsystem} device, but one of {other}");
-        let remedy = format!("sudo rm {shown} && sudo udevadm trigger --action=add --subsystem-match={subsystem}");
+        let remedy =
+            format!("sudo rm {} && sudo udevadm trigger --action=add --subsystem-match={subsystem}", word(shown));
         return Finding::error(check, found, remedy);
     }
     if let Some(first) = nodes.first() {
@@ -269,10 +276,8 @@ fn model(computer: &Computer) -> String {
 /// The subsystem of a node in /dev that is another device than its name says, such as a null device.
 fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<String> {
     let about = fs::metadata(node).ok().filter(|about| about.file_type().is_char_device())?;
-    let (major, minor) = (nix::sys::stat::major(about.rdev()), nix::sys::stat::minor(about.rdev()));
     // If the kernel does not tell, the node counts as right.
-    let subsystem = fs::read_link(computer.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;
-    let subsystem = subsystem.file_name()?.to_string_lossy().into_owned();
+    let subsystem = computer.subsystem(&about)?;
     (subsystem != class.subsystem).then_some(subsystem)
 }
 
@@ -499,7 +504,7 @@ pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
     };
     let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
     let programs: Vec<String> = computer
-        .processes()
+        .all_processes()
         .iter()
         .filter(|process| {
             let folder = computer.path(format!("/proc/{}/fd", process.pid));
@@ -571,6 +576,7 @@ mod tests {
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use pinion_linux::gpio::LineInfo;
+    use std::os::unix::fs::MetadataExt;
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
         let instances = instances(&tree.computer()).0;
@@ -647,7 +653,7 @@ mod tests {
     #[test]
     fn the_users_are_judged_that_pinion_runs_as() {
         let tree = Tree::new();
-        let look = || permissions(&tree.computer(), &instances(&tree.computer()).0, &BTreeSet::new());
+        let look = || permissions(&tree.computer(), &instances(&tree.called_by(54_321)).0, &BTreeSet::new());
         assert_eq!(told(&look(), "user", Warning, "there is no user pinion"), INSTALL);
         tree.put_mode("dev/gpiochip0", "", 0o660);
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
@@ -659,6 +665,9 @@ mod tests {
         // A running process counts, with its groups.
         tree.process(10, &["/usr/bin/pinion", "run"], 54_321, &[gid]);
         told(&look(), "gpio", Fine, "pinion may open");
+        // A stranger's does not.
+        tree.process(9, &["/usr/bin/pinion", "run"], 54_322, &[]);
+        assert_eq!(look().len(), 1, "{:?}", look());
         // Two users, one from a unit of its own.
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\n");
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
@@ -676,7 +685,7 @@ mod tests {
         // The simulated printer opens nothing.
         fs::remove_file(tree.computer().path("/etc/systemd/system/multi-user.target.wants/klipper-mcu.service"))
             .unwrap();
-        tree.process(10, &["/usr/bin/pinion", "run", "--board", "sim"], 54_322, &[]);
+        tree.process(10, &["/usr/bin/pinion", "run", "--board", "sim"], 54_321, &[]);
         told(&look(), "user", Warning, "there is no user pinion");
     }
 

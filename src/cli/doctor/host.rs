@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use crate::cli::computer::units::{self, setting};
 use crate::cli::computer::{Computer, Who};
 use crate::cli::finding::Finding;
+use crate::foreign::word;
 use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process};
 use pinion_firmware::feature::FEATURES;
@@ -40,14 +41,15 @@ impl Klippy {
     }
 
     pub(super) fn restart(&self) -> String {
-        format!("sudo systemctl restart {}", self.unit.as_deref().unwrap_or("klipper"))
+        format!("sudo systemctl restart {}", word(self.unit.as_deref().unwrap_or("klipper")))
     }
 }
 
-/// Each klippy: the running ones, and those whose units are enabled. If there is none: the installed ones.
+/// Each klippy: the running ones that no stranger has started, and those whose units are enabled. If there is none: the
+/// installed ones.
 pub(super) fn klippys(computer: &Computer) -> Vec<Klippy> {
-    let processes = computer.processes().into_iter().filter(Process::is_klippy);
-    let mut klippys: Vec<Klippy> = processes.filter_map(|process| running(computer, &process)).collect();
+    let processes = computer.processes(Process::is_klippy);
+    let mut klippys: Vec<Klippy> = processes.filter_map(|(process, unit)| running(computer, &process, unit)).collect();
     let runs: BTreeSet<String> = klippys.iter().filter_map(|klippy| klippy.unit.clone()).collect();
     let units = units::enabled(computer, |unit| !runs.contains(unit));
     klippys.extend(units.iter().filter_map(|unit| set_up(computer, unit)));
@@ -57,7 +59,7 @@ pub(super) fn klippys(computer: &Computer) -> Vec<Klippy> {
     klippys
 }
 
-fn running(computer: &Computer, process: &Process) -> Option<Klippy> {
+fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Option<Klippy> {
     let proc = computer.path("/proc");
     let config = process.klippy_config(&proc).map(|config| computer.name(&config));
     Some(Klippy {
@@ -65,7 +67,7 @@ fn running(computer: &Computer, process: &Process) -> Option<Klippy> {
         folder: process.klippy_folder(&proc).map(|folder| reachable(computer, folder)),
         printer: config.and_then(|config| printer::read(computer, &config)),
         found_by: format!("process {}", process.pid),
-        unit: computer.unit_of(process.pid),
+        unit,
         is_running: true,
     })
 }
@@ -138,6 +140,23 @@ pub(super) fn dialects(computer: &Computer, instances: &[Instance], klippys: &[K
         return vec![Finding::ok(DIALECT, found).or("pinion doctor --klipper DIR looks at a checkout")];
     }
     klippys.iter().flat_map(|klippy| dialect(computer, instances, klippy)).collect()
+}
+
+/// The processes that are called like a Pinion or a klippy, and that are neither a service's nor root's nor the
+/// caller's. Any user can have one, and no other finding is about them.
+pub(super) fn strangers(computer: &Computer) -> Option<Finding> {
+    /// A user can have thousands.
+    const SHOWN: usize = 5;
+    let strangers = computer.strangers();
+    let pids: Vec<String> = strangers.iter().take(SHOWN).map(|process| process.pid.to_string()).collect();
+    let more = strangers.len().checked_sub(SHOWN).filter(|more| *more > 0);
+    let more = more.map_or(String::new(), |more| format!(" and {more} more"));
+    let found = format!(
+        "other users have processes with the names of a Pinion or a klippy, which do not count here: {}{more}",
+        pids.join(", ")
+    );
+    (!strangers.is_empty())
+        .then(|| Finding::ok("strangers", found).or("if one of them is yours, have a service start it"))
 }
 
 const DIALECT: &str = "dialect";

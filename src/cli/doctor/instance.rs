@@ -12,6 +12,7 @@ use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
 use crate::cli::run_args;
 use crate::cli::settings::{Given, Settings};
+use crate::foreign::word;
 use crate::klippy::{HOST_PATHS, is_host_path};
 
 /// The unit of the usual instance.
@@ -78,7 +79,7 @@ impl Instance {
     /// How to restart it.
     pub(super) fn restart(&self) -> String {
         match &self.unit {
-            Some(unit) => format!("sudo systemctl restart {unit}"),
+            Some(unit) => format!("sudo systemctl restart {}", word(unit)),
             None => "start it anew".to_owned(),
         }
     }
@@ -179,20 +180,20 @@ fn config_of(computer: &Computer, unit: &str) -> Option<String> {
 /// A link that klippy takes and that leads to this path.
 fn link_to(computer: &Computer, path: &Path) -> Option<PathBuf> {
     let mut links = computer.matching(format!("{HOST_PATHS}*")).into_iter().map(|link| computer.name(&link));
-    links.find(|link| computer.follow(link).is_ok_and(|way| way.contains(&computer.path(path))))
+    links.find(|link| is_host_path(link) && computer.follow(link).is_ok_and(|way| way.contains(&computer.path(path))))
 }
 
 /// The settings in the files of a unit.
 fn given(computer: &Computer, unit: &str, files: &Files, config: Option<&str>, findings: &mut Vec<Finding>) -> Given {
     let Files { options: options_name, symlink, .. } = files;
-    let restart = format!("sudo systemctl restart {unit}");
+    let restart = format!("sudo systemctl restart {}", word(unit));
     let mut given = Given::default();
     match options(computer, options_name) {
         Ok(options) => given = given.or(options),
         Err(error) => findings.push(Finding::error(
             "options",
             format!("{options_name}: {error}"),
-            format!("sudo nano {options_name}, then {restart}"),
+            format!("sudo nano {}, then {restart}", word(options_name)),
         )),
     }
     // This is on the unit's command line, before the options.
@@ -206,7 +207,7 @@ fn given(computer: &Computer, unit: &str, files: &Files, config: Option<&str>, f
                 given = given.or(file);
             }
             Err(error) => {
-                let remedy = format!("sudo nano {config_name}, then {restart}");
+                let remedy = format!("sudo nano {}, then {restart}", word(config_name));
                 findings.push(Finding::error("config", error.to_string(), remedy));
             }
         }
@@ -216,7 +217,7 @@ fn given(computer: &Computer, unit: &str, files: &Files, config: Option<&str>, f
                 format!("sudo install -D -m 644 {DELIVERED} {SYSTEM_FILE}, then {restart}")
             }
             SYSTEM_FILE => "sudo make install".into(),
-            name => format!("sudo cp {SYSTEM_FILE} {name}, then {restart}"),
+            name => format!("sudo cp {SYSTEM_FILE} {}, then {restart}", word(name)),
         };
         findings.push(Finding::error(
             "config",
@@ -315,7 +316,7 @@ mod tests {
     #[test]
     fn an_instance_that_was_started_by_hand_may_have_a_link_that_klippy_does_not_take() {
         let tree = Tree::new();
-        tree.process(30, &["pinion", "run", "--board", "sim", "-I", "/home/pi/sim"], 1000, &[]);
+        tree.process(30, &["pinion", "run", "--board", "sim", "-I", "/home/pi/sim"], 0, &[]);
         let link = || instances(&tree.computer()).0[0].link.clone();
         assert_eq!(link(), None);
         tree.put("dev/pts/4", "");

@@ -11,6 +11,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
 use crate::cli::trace::read;
+use crate::foreign::word;
 use crate::trace::folder::{all, folders, utc_text};
 use crate::trace::verdict::{Culprit, verdict};
 
@@ -41,7 +42,7 @@ pub(super) fn finding(computer: &Computer, now: SystemTime) -> Finding {
     let found = format!("{}: {}", utc_text(trace.head.utc_ms), told.text);
     let at = UNIX_EPOCH + Duration::from_millis(trace.head.utc_ms);
     let is_recent = now.duration_since(at).is_ok_and(|age| age <= RECENT);
-    let look = format!("pinion trace {}", name.display());
+    let look = format!("pinion trace {}", word(name.display()));
     match told.culprit {
         Culprit::Nobody => Finding::ok(CHECK, found),
         _ if is_recent => Finding::warning(CHECK, found, look),

@@ -97,7 +97,10 @@ fn examine(computer: &Computer) -> Vec<Group> {
         Group::new("service", [configurations, service::findings(computer, &instances)].concat()),
         Group::new("watchdog", service::watchdog(computer, &instances, program(SYSTEMCTL))),
         Group::new("terminal", terminal::terminals(computer, &instances, &klippys)),
-        Group::new("host", host::dialects(computer, &instances, &klippys)),
+        Group::new(
+            "host",
+            host::dialects(computer, &instances, &klippys).into_iter().chain(host::strangers(computer)).collect(),
+        ),
         Group::new(
             "pins and buses",
             [
@@ -201,6 +204,7 @@ mod tests {
         tree.process(7, &["/tmp/pinion", "run", "--config", "/sys/kernel/realtime"], 65534, &[]);
         tree.process(8, &["python3", "/tmp/klippy.py", "/sys/kernel/realtime"], 65534, &[]);
         examine(&tree.computer());
+        examine(&tree.called_by(65534));
     }
 
     #[test]
@@ -213,7 +217,11 @@ mod tests {
             tree.process(pid, &["python3", &klippy, &config], 65534, &[]);
             tree.process(pid + 10, &["/tmp/pinion", "run", "-I", &format!("/tmp/klipper_host_{name}")], 65534, &[]);
         }
-        tree.put("proc/8/cgroup", &format!("0::/system.slice/klippy{name}.service\n"));
+        for (pid, unit) in
+            [(7, "klipper"), (8, "klippy\\x20\x1b\u{202e};reboot"), (17, "pinion-mcu"), (18, "pinion $(id)")]
+        {
+            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+        }
         tree.put(&config[1..], &format!("[mcu]\nserial: /tmp/klipper_host_{}\n", name.replace('\n', "")));
         tree.put(&format!("etc/systemd/system/multi-user.target.wants/pinion-mcu@{name}.service"), "");
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux\x1b[2J\"");
@@ -233,6 +241,8 @@ mod tests {
         assert_eq!(foreign.len(), 1, "all but the last line: {foreign:#?}");
         assert!(!page.lines().any(|line| line.starts_with("  error    forged")), "{page}");
         assert!(page.to_string().contains("a?  error    forged?<0>b?[2Jc?"), "{page}");
+        // Nor does a name leave its word in a command.
+        assert!(page.to_string().contains("systemctl enable --now 'pinion $(id)'\n"), "{page}");
     }
 
     #[test]

@@ -4,10 +4,11 @@
 #![forbid(unsafe_code)]
 
 use std::collections::BTreeSet;
-use std::path::Path;
 
+use crate::cli::computer::device::Port;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
+use crate::klippy::process::Process;
 
 use super::devices::{is_pi, is_pi5, pi_config};
 
@@ -25,10 +26,16 @@ pub(super) fn ports(computer: &Computer, names: &BTreeSet<&str>) -> Vec<Finding>
 /// A port, by its name in /dev.
 fn port(computer: &Computer, named: &str) -> Vec<Finding> {
     let node = format!("/dev/{named}");
-    let way = computer.follow(Path::new(&node)).unwrap_or_default();
-    let Some(name) = way.last().and_then(|last| last.file_name()?.to_str()) else {
-        let found = format!("TMC UART: there is no {node}");
-        return vec![Finding::error(CHECK, found, missing(computer, named))];
+    let name = &match computer.port(named) {
+        Port::There(name) => name,
+        Port::Missing => {
+            let found = format!("TMC UART: there is no {node}");
+            return vec![Finding::error(CHECK, found, missing(computer, named))];
+        }
+        Port::Other => {
+            let found = format!("TMC UART: {named} is no serial port");
+            return vec![Finding::error(CHECK, found, "another uart_pin in printer.cfg (pinion pins lists the ports)")];
+        }
     };
     let mut findings = Vec::new();
     let is_port = |word: &str| word.rsplit('/').next().is_some_and(|word| word == name || word == named);
@@ -42,23 +49,26 @@ fn port(computer: &Computer, named: &str) -> Vec<Finding> {
     }
     let getty = format!("serial-getty@{name}");
     let mut login = units::enabled(computer, |unit| unit == getty).first().map(|_| format!("{getty}.service"));
-    for process in computer.processes() {
-        let words: Vec<_> = process.arguments.iter().map(|word| word.to_string_lossy()).collect();
-        let Some((program, arguments)) = words.split_first() else { continue };
-        let program = program.rsplit('/').next().unwrap_or_default().trim_start_matches('-');
-        if !arguments.iter().any(|word| is_port(word)) {
+    let program = |process: &Process| {
+        let program = process.program().unwrap_or_default().to_string_lossy();
+        program.trim_start_matches('-').to_owned()
+    };
+    let uses_it = |process: &Process| {
+        let is_known = LOGIN.iter().chain(&BLUETOOTH).any(|known| *known == program(process));
+        is_known && process.arguments.iter().skip(1).any(|word| is_port(&word.to_string_lossy()))
+    };
+    for (process, _) in computer.processes(uses_it) {
+        let program = program(&process);
+        if LOGIN.contains(&&*program) {
+            login = Some(format!("{program} (process {})", process.pid));
             continue;
         }
-        if LOGIN.contains(&program) {
-            login = Some(format!("{program} (process {})", process.pid));
-        } else if BLUETOOTH.contains(&program) {
-            let found = format!("TMC UART: {node} is the port of Bluetooth: {program} (process {})", process.pid);
-            let remedy = match is_pi(computer) {
-                true => no_bluetooth(computer),
-                false => format!("end process {}, or choose another port", process.pid),
-            };
-            findings.push(Finding::error(CHECK, found, remedy));
-        }
+        let found = format!("TMC UART: {node} is the port of Bluetooth: {program} (process {})", process.pid);
+        let remedy = match is_pi(computer) {
+            true => no_bluetooth(computer),
+            false => format!("end process {}, or choose another port", process.pid),
+        };
+        findings.push(Finding::error(CHECK, found, remedy));
     }
     // serial0 often leads to one of these.
     if is_pi5(computer) && name == "ttyAMA10" {

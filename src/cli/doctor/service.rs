@@ -9,6 +9,7 @@ use crate::cli::computer::manager::watchdog_of_systemd;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::{Finding, Level};
 use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
+use crate::foreign::word;
 use crate::proc::stat_field;
 
 use super::INSTALL;
@@ -37,7 +38,8 @@ fn state(computer: &Computer, instance: &Instance) -> Finding {
     };
     let is_enabled = !units::enabled(computer, |name| name == unit).is_empty();
     let is_installed = units::is_installed(computer, unit);
-    let enable = format!("sudo systemctl enable --now {unit}");
+    let word = word(unit);
+    let enable = format!("sudo systemctl enable --now {word}");
     match (instance.pid, is_enabled) {
         (Some(pid), true) => Finding::ok(CHECK, format!("{} ({unit})", runs(pid))),
         (Some(pid), false) => {
@@ -46,7 +48,7 @@ fn state(computer: &Computer, instance: &Instance) -> Finding {
         (None, true) => Finding::error(
             CHECK,
             format!("Pinion does not run, though its service is enabled ({unit})"),
-            format!("sudo systemctl restart {unit}; journalctl -u {unit} says why it ended"),
+            format!("sudo systemctl restart {word}; journalctl -u {word} says why it ended"),
         ),
         (None, false) if is_installed => Finding::warning(CHECK, "Pinion does not run", enable),
         (None, false) => Finding::warning(CHECK, "Pinion does not run, and its service is not installed", INSTALL),
@@ -86,7 +88,7 @@ fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
         Some(stat_field(stat.as_bytes(), POLICY)? == SCHED_FIFO)
     });
     let policies: Vec<bool> = policies.collect();
-    let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {unit}"));
+    let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {}", word(unit)));
     Some(match (policies.is_empty(), policies.contains(&true)) {
         (true, _) => Finding::ok(CHECK, format!("whether Pinion (process {pid}) runs in real time is unknown")),
         (_, true) => Finding::ok(CHECK, format!("Pinion (process {pid}) runs in real time")),
@@ -107,11 +109,8 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, which stops Pinion, while printing, too";
     let mut findings = Vec::new();
     let is_it = |name: &std::ffi::OsStr| name == "klipper_mcu";
-    let process = computer
-        .processes()
-        .into_iter()
-        .find(|process| process.arguments.first().and_then(|program| program.file_name()).is_some_and(is_it));
-    if let Some(process) = process {
+    let process = computer.processes(|process| process.program().is_some_and(is_it)).next();
+    if let Some((process, _)) = process {
         let found = format!("Klipper's own klipper_mcu runs (process {}): it has the link and the pins", process.pid);
         findings.push(Finding::error(CHECK, found, STOP));
     }
@@ -128,8 +127,11 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     {
         // `systemctl mask` would make a link to /dev/null in the place of a file in that folder.
         let remedy = match file.starts_with(units::ADMINISTRATOR_S) {
-            true => format!("sudo mv {file} {file}.before-pinion && sudo systemctl daemon-reload"),
-            false => format!("sudo systemctl mask {unit}"),
+            true => {
+                let old = format!("{file}.before-pinion");
+                format!("sudo mv {} {} && sudo systemctl daemon-reload", word(&file), word(old))
+            }
+            false => format!("sudo systemctl mask {}", word(&unit)),
         };
         findings.push(Finding::warning(CHECK, format!("{file} is still there: {STARTED_BY_FLASH}"), remedy));
     }
@@ -191,7 +193,7 @@ mod tests {
     use std::fs;
 
     fn found(tree: &Tree) -> Vec<Finding> {
-        let computer = tree.computer();
+        let computer = tree.called_by(990);
         findings(&computer, &instances(&computer).0)
     }
 
@@ -237,7 +239,7 @@ mod tests {
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=--board linux\n");
         assert!(!is_told());
         // People try it by hand in this way.
-        tree.process(10, &["pinion", "run", "--board", "sim"], 1000, &[]);
+        tree.process(10, &["pinion", "run", "--board", "sim"], 990, &[]);
         told(&found(&tree), "board", Ok, "process 10 has a simulated printer");
     }
 

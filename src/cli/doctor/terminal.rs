@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use crate::cli::check;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::{Finding, Level};
+use crate::foreign::word;
 use crate::klippy::{HOST_PATHS, is_host_path};
 use crate::runtime::Place;
 
@@ -62,13 +63,14 @@ pub(super) fn terminals(computer: &Computer, instances: &[Instance], klippys: &[
 fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klippys: &[Klippy]) -> Vec<Finding> {
     let shown = path.display();
     let opening: Vec<&Klippy> = klippys.iter().filter(|klippy| klippy.opens(path)).collect();
-    let restart = instance.map_or_else(|| format!("sudo systemctl restart {}", unit_for(path)), Instance::restart);
+    let restart =
+        instance.map_or_else(|| format!("sudo systemctl restart {}", word(unit_for(path))), Instance::restart);
     let place = Place::of(&computer.path(path));
     if let Some(obstacle) = place.obstacle(path) {
         let clear = match place {
             // The folder may have something in it.
-            Place::Folder => format!("sudo mv {shown} {shown}.old"),
-            _ => format!("sudo rm {shown}"),
+            Place::Folder => format!("sudo mv -T {0} {0}.old", word(shown)),
+            _ => format!("sudo rm {}", word(shown)),
         };
         return vec![Finding::error(CHECK, obstacle, format!("{clear} && {restart}"))];
     }
@@ -80,7 +82,7 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
         let target = fs::read_link(computer.path(path)).unwrap_or_default();
         let found = format!("{shown} leads to {}, which is not there", target.display());
         return vec![match pid {
-            None => Finding::warning(CHECK, found, format!("sudo systemctl start {}", unit_for(path))),
+            None => Finding::warning(CHECK, found, format!("sudo systemctl start {}", word(unit_for(path)))),
             Some(_) => Finding::error(CHECK, found, restart),
         }];
     };
@@ -88,6 +90,11 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
         Some((device, Ok(about))) => (device, about),
         _ => return vec![Finding::error(CHECK, format!("{shown} leads nowhere"), restart)],
     };
+    // Any user can make a link in /tmp to any file, and the remedies below are about the file.
+    if !computer.is_terminal(&device, &about) {
+        let found = format!("{shown} leads to {}, which is no pseudo terminal", device.display());
+        return vec![Finding::error(CHECK, found, format!("sudo rm {} && {restart}", word(shown)))];
+    }
     let told = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));
     if opening.is_empty() {
         let unknown = match klippys {
@@ -119,7 +126,7 @@ fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Fin
                 true => {
                     let remedy = format!(
                         "sudo systemctl enable --now {} (on another computer: pinion link), or another serial",
-                        unit_for(path)
+                        word(unit_for(path))
                     );
                     Finding::error(CHECK, found, remedy)
                 }
@@ -183,7 +190,7 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
     });
     if let Some((folder, ownership)) = closed {
         let found = format!("{name} may not enter {}, which is {ownership}", folder.display());
-        return Finding::error(CHECK, found, format!("sudo chmod o+x {}", folder.display()));
+        return Finding::error(CHECK, found, format!("sudo chmod o+x {}", word(folder.display())));
     }
     if who.may(Access::READ_WRITE, about) {
         return Finding::ok(CHECK, told);
@@ -198,7 +205,9 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
         _ if is_member && *is_running => {
             format!("{}, as the user was made a member after it was started", klippy.restart())
         }
-        (_, group) => format!("sudo usermod -aG {} {name} && {}", group.unwrap_or_default(), klippy.restart()),
+        (_, group) => {
+            format!("sudo usermod -aG {} {} && {}", word(group.unwrap_or_default()), word(name), klippy.restart())
+        }
     };
     Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)
 }
@@ -243,7 +252,7 @@ mod tests {
     }
 
     fn looked(tree: &Tree) -> Vec<Finding> {
-        let computer = tree.computer();
+        let computer = tree.called_by(PI);
         terminals(&computer, &instances(&computer).0, &klippys(&computer))
     }
 
@@ -258,7 +267,7 @@ mod tests {
         tree.process(8, &KLIPPY, PI, &[gid]);
         told(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
         tree.process(8, &KLIPPY, PI, &[]);
-        // A user that names a process like this gets no advice that is of use.
+        // Advice about users is only for a service's klippy.
         let remedy = told(&looked(&tree), "terminal", Warning, "pi, klippy's user (process 8), may not open it");
         assert!(!remedy.contains("sudo"), "{remedy}");
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
@@ -302,7 +311,7 @@ mod tests {
     fn a_link_that_is_none_or_leads_nowhere() {
         let tree = Tree::new();
         told(&looked(&tree), "terminal", Ok, "as Pinion does not run");
-        tree.process(10, &["/usr/bin/pinion", "run"], 990, &[]);
+        tree.process(10, &["/usr/bin/pinion", "run"], 0, &[]);
         told(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_mcu");
         tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
         told(&looked(&tree), "terminal", Error, "which is not there");
@@ -312,7 +321,7 @@ mod tests {
         let tree = Tree::new();
         tree.put("tmp/klipper_host_mcu/file", "");
         let remedy = told(&looked(&tree), "terminal", Error, "/tmp/klipper_host_mcu is a folder");
-        assert!(remedy.starts_with("sudo mv /tmp/klipper_host_mcu /tmp/klipper_host_mcu.old && "), "{remedy}");
+        assert!(remedy.starts_with("sudo mv -T /tmp/klipper_host_mcu /tmp/klipper_host_mcu.old && "), "{remedy}");
         let tree = Tree::new();
         tree.put("tmp/klipper_host_mcu", "FORCE_SHUTDOWN\n");
         let remedy = told(&looked(&tree), "terminal", Error, "exists and is no symbolic link");
@@ -392,9 +401,12 @@ mod tests {
         assert_eq!(remedy, "serial: /tmp/klipper_host_b");
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
         tree.put("proc/22/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
+        assert!(!format!("{:?}", looked(&tree)).contains("klipper_host_c"), "a stranger's klippy");
+        let script = "/home/other/klipper/klippy/klippy.py";
+        tree.process(22, &["/usr/bin/python3", script, "/home/other/printer.cfg"], PI, &[]);
         let remedy = told(&looked(&tree), "terminal", Warning, "there is no /tmp/klipper_host_c, which klippy's");
         assert!(!remedy.contains("sudo"), "{remedy}");
-        tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 1000, &[]);
+        tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 0, &[]);
         told(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
     }
 }

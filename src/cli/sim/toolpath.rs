@@ -3,8 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
@@ -14,13 +13,16 @@ use std::time::Duration;
 use clap::Args;
 
 use crate::cli::failed;
+use crate::cli::files::{self, Output};
 use crate::cli::page::{Page, aligned, print};
 use pinion_firmware::time::{Clock, Ticks};
+use pinion_firmware::trouble::Trouble;
 use pinion_sim::{
-    AskedPath, Body, Comparison, Distances, PathPoint, Recorder, RingWatch, SimProbe, compare, write_gcode, write_stl,
-    write_svg,
+    AskedPath, Body, Comparison, Distances, Recorder, RingWatch, SimProbe, compare, write_gcode, write_stl, write_svg,
 };
 
+/// Longest G-code file.
+const GCODE_MIB: u64 = 1024;
 /// Time between two reads of the steps.
 const READ_PERIOD: Duration = Duration::from_millis(50);
 /// How late a step may be made.
@@ -36,7 +38,7 @@ pub(in crate::cli) struct PathArgs {
     /// At the end, print how far the motors' path was from the one that this file asks for. It serves a host,
     /// without the demonstration
     #[arg(long, value_name = "FILE.gcode", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
-    compare: Option<PathBuf>,
+    pub(super) compare: Option<PathBuf>,
     /// The distance along x and y above which `--compare` ends with exit status 1
     #[arg(long, value_name = "MM", requires = "compare", default_value_t = 0.1)]
     within: f64,
@@ -52,44 +54,49 @@ enum Form {
 
 /// The files of the options, checked before the printer starts.
 pub(in crate::cli) struct Files {
-    toolpath: Option<(PathBuf, Form)>,
+    toolpath: Option<(Output, Form)>,
     compare: Option<(PathBuf, AskedPath)>,
     within_mm: f64,
 }
 
 impl Files {
-    /// Checks the files; `None` without the options.
-    pub(in crate::cli) fn check(args: &PathArgs) -> Result<Option<Files>, String> {
+    /// Checks the files; `None` without the options. The command reads `inputs`.
+    pub(in crate::cli) fn check(args: &PathArgs, inputs: &[&Path]) -> Result<Option<Files>, String> {
         if args.toolpath.is_none() && args.compare.is_none() {
             return Ok(None);
         }
         let compare = match &args.compare {
-            Some(path) => Some((path.clone(), AskedPath::load(path).map_err(|error| error.to_string())?)),
+            Some(path) => Some((path.clone(), asked(path).map_err(|error| error.to_string())?)),
             None => None,
         };
         if !(args.within.is_finite() && args.within > 0.0) {
             return Err(format!("--within {} is no distance: give millimeters above 0", args.within));
         }
-        let toolpath = args.toolpath.as_deref().map(form).transpose()?;
+        let toolpath = match args.toolpath.as_deref() {
+            Some(path) => Some((Output::check(path, inputs)?, form(path)?)),
+            None => None,
+        };
         Ok(Some(Files { toolpath, compare, within_mm: args.within }))
     }
 }
 
-/// The form by the file's extension. The file must be writable: a long print is not lost at its end.
-fn form(path: &Path) -> Result<(PathBuf, Form), String> {
-    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
-    let form = match extension.to_ascii_lowercase().as_str() {
-        "svg" => Form::Drawing,
-        "stl" => Form::Solid,
-        "gcode" => Form::Moves,
-        _ => return Err(format!("{}: the extension says no form: name it .svg, .stl or .gcode", path.display())),
-    };
-    OpenOptions::new().create(true).append(true).open(path).map_err(|error| unwritable(path, &error))?;
-    Ok((path.to_owned(), form))
+/// The path that a G-code file asks for.
+fn asked(path: &Path) -> Result<AskedPath, Trouble> {
+    let file = path.display().to_string();
+    let opened = files::open(path, GCODE_MIB)
+        .map_err(|error| Trouble::new(error.to_string()).of(&file).remedy("name a readable G-code file"))?;
+    AskedPath::read(BufReader::new(opened), &file)
 }
 
-fn unwritable(path: &Path, error: &io::Error) -> String {
-    format!("{} cannot be written: {error}: name a file in a folder of yours", path.display())
+/// The form by the file's extension.
+fn form(path: &Path) -> Result<Form, String> {
+    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
+    match extension.to_ascii_lowercase().as_str() {
+        "svg" => Ok(Form::Drawing),
+        "stl" => Ok(Form::Solid),
+        "gcode" => Ok(Form::Moves),
+        _ => Err(format!("{}: the extension says no form: name it .svg, .stl or .gcode", path.display())),
+    }
 }
 
 /// The thread that records the path.
@@ -143,10 +150,10 @@ impl PathRecord {
         let points = recorded.recorder.points();
         let mut page = Page::default();
         let mut troubles = Vec::new();
-        if let Some((path, form)) = &files.toolpath {
-            match write(path, *form, points) {
+        if let Some((output, form)) = &files.toolpath {
+            match write(output, *form, &recorded.recorder) {
                 Ok(said) => page.line(said),
-                Err(error) => troubles.push(unwritable(path, &error)),
+                Err(error) => troubles.push(error),
             }
         }
         if recorded.recorder.gaps() > 0 {
@@ -163,7 +170,10 @@ impl PathRecord {
                 troubles
                     .push(format!("axis {name} lost {count} steps at an end of its travel: look at the moves there"));
             }
-            report(&mut page, &mut troubles, path, compare(points, asked), files.within_mm);
+            match compare(points, asked) {
+                Ok(found) => report(&mut page, &mut troubles, path, &found, files.within_mm),
+                Err(trouble) => troubles.push(trouble.of(path.display()).to_string()),
+            }
             for ring in &recorded.rings {
                 if let Some(seen) = ring.seen() {
                     page.line(format_args!(
@@ -185,36 +195,29 @@ impl PathRecord {
 }
 
 /// Writes the path, and says what was written.
-fn write(path: &Path, form: Form, points: &[PathPoint]) -> io::Result<String> {
-    let mut out = BufWriter::new(File::create(path)?);
-    let (file, count) = (path.display(), points.len());
-    let said = match form {
+fn write(output: &Output, form: Form, recorder: &Recorder) -> Result<String, String> {
+    let points = recorder.points();
+    let (file, count) = (output.path(), points.len());
+    output.write(|out| match form {
         Form::Drawing => {
-            write_svg(points, &mut out)?;
-            format!("drawn: {file} ({count} points)")
+            write_svg(points, recorder.filament_step_mm(), out)?;
+            Ok(format!("drawn: {file} ({count} points)"))
         }
         Form::Moves => {
-            write_gcode(points, &mut out)?;
-            format!("written: {file} ({count} points)")
+            write_gcode(points, out)?;
+            Ok(format!("written: {file} ({count} points)"))
         }
         Form::Solid => {
-            let Body { off_mm, left_out } = write_stl(points, &mut out)?;
+            let Body { off_mm, left_out } = write_stl(points, recorder.filament_step_mm(), out)?;
             let left_out = if left_out > 0 { format!(", {left_out} lines had no room") } else { String::new() };
-            format!("written: {file} (at most {off_mm} mm off the path{left_out})")
+            Ok(format!("written: {file} (at most {off_mm} mm off the path{left_out})"))
         }
-    };
-    out.flush()?;
-    Ok(said)
+    })
 }
 
 /// Adds the comparison to the page.
-fn report(page: &mut Page, troubles: &mut Vec<String>, path: &Path, found: Option<Comparison>, within_mm: f64) {
+fn report(page: &mut Page, troubles: &mut Vec<String>, path: &Path, found: &Comparison, within_mm: f64) {
     let file = path.display();
-    let Some(found) = found else {
-        let cause = "the motors never went along the path of this file";
-        troubles.push(format!("{file}: {cause}: print it, and check position_endstop and the offsets"));
-        return;
-    };
     let head = ["layer", "z mm", "greatest mm", "at line", "mean mm", "greatest z mm", "path mm"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     let row = |layer: String, z: String, found: &Distances| {

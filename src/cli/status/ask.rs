@@ -25,8 +25,8 @@ const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 const ANSWER_MAX: usize = 4 << 20;
 
 /// A Pinion's answer.
-pub(super) struct Answer {
-    pub(super) status: Status,
+pub(in crate::cli) struct Answer {
+    pub(in crate::cli) status: Status,
     /// One line about the fields that this version does not know.
     pub(super) notice: Option<String>,
 }
@@ -34,7 +34,12 @@ pub(super) struct Answer {
 /// Asks the first socket that answers.
 pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
     let paths = args.socket.clone().map_or_else(|| socket_paths(&args.symlink), |path| vec![path]);
-    let (path, document) = fetch(&paths, &args.symlink, ANSWER_MAX)?;
+    ask_at(&paths, &args.symlink)
+}
+
+/// Asks the first of these sockets that answers. They are of the instance with this link.
+pub(in crate::cli) fn ask_at(paths: &[PathBuf], link: &Path) -> Result<Answer, String> {
+    let (path, document) = fetch(paths, link, ANSWER_MAX)?;
     answer(&path, &document)
 }
 

@@ -6,11 +6,14 @@
 use crate::cli::page::{Page, aligned};
 use crate::status::{BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, Recorder, State, Status};
 
+/// Width of the column with the heads of the lines.
+pub(super) const HEAD: usize = 10;
+
 /// Writes the page.
 pub(super) fn page(status: &Status) -> Page {
     let mut page = Page::default();
     let mcu = status.mcu.as_ref();
-    let mut row = |head: &str, text: String| page.line(format_args!("{head:<10}{text}"));
+    let mut row = |head: &str, text: String| page.line(format_args!("{head:<HEAD$}{text}"));
     row("pinion", format!("{}, process {}, up for {}", status.version, status.pid, span(status.uptime_s)));
     row("link", format!("{} ({})", status.link, status.terminal));
     row("board", status.board.clone());
@@ -33,8 +36,11 @@ pub(super) fn page(status: &Status) -> Page {
         row("timers", lateness(&mcu.lateness));
     }
     row("queues", queues(&mcu.queues));
+    // What is measured is read most, and pins are the most.
+    let (measured, others): (Vec<&Object>, Vec<&Object>) =
+        mcu.objects.iter().partition(|object| matches!(object.value, Some(Present::Adc(_))));
+    table(&mut page, "objects", measured.into_iter().chain(others).map(object).collect());
     table(&mut page, "lines", mcu.lines.iter().map(line).collect());
-    table(&mut page, "objects", mcu.objects.iter().map(object).collect());
     page
 }
 
@@ -123,7 +129,7 @@ fn transfers(BusCounts { transfers, errors, retries }: BusCounts) -> String {
 
 fn table(page: &mut Page, head: &str, rows: Vec<Vec<String>>) {
     for (n, line) in aligned(&rows).iter().enumerate() {
-        page.line(format_args!("{:<10}{line}", if n == 0 { head } else { "" }));
+        page.line(format_args!("{:<HEAD$}{line}", if n == 0 { head } else { "" }));
     }
 }
 

@@ -15,10 +15,11 @@ use termina::escape::csi::DecPrivateModeCode as Code;
 use termina::event::KeyCode;
 
 use crate::cli::page::{Page, draw};
-use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, give_back_at, off, on, rows, to_row};
+use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, give_back_at, off, on, size, to_row};
 use crate::runtime::hang_up;
 
 use super::ask::ask;
+use super::text::HEAD;
 use super::{StatusArgs, show};
 
 /// Time between two looks.
@@ -59,29 +60,35 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
         if shown.is_err() {
             return Ok(());
         }
-        let next = Instant::now() + PERIOD;
+        let mut next = Instant::now() + PERIOD;
         while Instant::now() < next {
-            let wish = match &mut screen {
-                Some(screen) => screen.wish(),
+            let wishes = match &mut screen {
+                Some(screen) => screen.wishes(),
                 None => {
                     thread::sleep(KEY_WAIT);
-                    None
+                    vec![]
                 }
             };
-            if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
+            if ended.load(Ordering::Relaxed) {
                 return Ok(());
             }
-            if let (Some(Wish::Scroll(scroll)), Some(screen)) = (wish, &mut screen)
-                && screen.scroll(scroll).is_err()
-            {
-                return Ok(());
-            }
-            if wish == Some(Wish::Stop) {
-                drop(screen.take());
-                // The kernel does not stop it if nobody could continue it.
-                let _ = raise(Signal::SIGTSTP);
-                screen = Some(Screen::enter().map_err(gone)?);
-                break;
+            for wish in wishes {
+                match (wish, &mut screen) {
+                    (Wish::End, _) => return Ok(()),
+                    (Wish::Scroll(scroll), Some(screen)) => {
+                        if screen.scroll(scroll).is_err() {
+                            return Ok(());
+                        }
+                    }
+                    (Wish::Scroll(_), None) => {}
+                    (Wish::Stop, _) => {
+                        drop(screen.take());
+                        // The kernel does not stop it if nobody could continue it.
+                        let _ = raise(Signal::SIGTSTP);
+                        screen = Some(Screen::enter().map_err(gone)?);
+                        next = Instant::now();
+                    }
+                }
             }
         }
     }
@@ -152,22 +159,39 @@ impl View {
         .min(lowest);
     }
 
-    /// The visible lines of a page, and the text below them.
-    fn of<'a>(&mut self, page: &'a Page, ends: &str) -> (Vec<&'a str>, String) {
-        let lines = page.lines().count();
-        self.scroll(Scroll::Lines(0), lines);
-        let shown: Vec<&str> = page.lines().skip(self.above).take(self.room).collect();
-        let last = self.above + shown.len();
-        let foot = match lines > self.room {
-            true => format!("lines {} to {last} of {lines}: arrows and page keys show others; {ends}", self.above + 1),
+    /// The visible ones of a page's lines, and the text below them.
+    fn of<'a>(&mut self, lines: &'a [String], ends: &str) -> (&'a [String], String) {
+        let count = lines.len();
+        self.scroll(Scroll::Lines(0), count);
+        let last = count.min(self.above + self.room);
+        let shown = &lines[self.above..last];
+        let foot = match count > self.room {
+            true => format!("lines {} to {last} of {count}: arrows and page keys show others; {ends}", self.above + 1),
             false => ends.to_owned(),
         };
         (shown, foot)
     }
 }
 
-/// A terminal that is drawn on in place: its alternate screen, without a cursor, with long lines cut off. When this is
-/// dropped, the terminal is as before.
+/// The lines of a page on a terminal with this many columns. A long line goes on in the next row, below its text.
+fn wrapped(page: &Page, columns: usize) -> Vec<String> {
+    let indent = " ".repeat(HEAD.min(columns / 2));
+    let mut rows = Vec::new();
+    for line in page.lines() {
+        let (mut rest, mut before) = (line, "");
+        while let Some((end, _)) = rest.char_indices().nth(columns.saturating_sub(before.len()).max(1)) {
+            // A word that is longer than a row is cut.
+            let cut = rest[..=end].rfind(' ').filter(|at| !rest[..*at].trim().is_empty()).unwrap_or(end);
+            rows.push(format!("{before}{}", rest[..cut].trim_end()));
+            (rest, before) = (rest[cut..].trim_start(), &indent);
+        }
+        rows.push(format!("{before}{rest}"));
+    }
+    rows
+}
+
+/// A terminal that is drawn on in place: its alternate screen, without a cursor. When this is dropped, the terminal is
+/// as before.
 struct Screen {
     terminal: Terminal,
     page: Page,
@@ -192,25 +216,27 @@ impl Screen {
     }
 
     fn scroll(&mut self, scroll: Scroll) -> io::Result<()> {
-        self.view.scroll(scroll, self.page.lines().count());
+        self.view.scroll(scroll, wrapped(&self.page, size().columns).len());
         self.draw()
     }
 
     /// Draws as much of the page as the terminal has rows for.
     fn draw(&mut self) -> io::Result<()> {
-        self.view.room = rows().saturating_sub(1);
+        let size = size();
+        self.view.room = size.rows.saturating_sub(1);
         let ends = if self.terminal.has_keys() { "q ends" } else { "Ctrl-C ends" };
-        let (lines, foot) = self.view.of(&self.page, ends);
+        let lines = wrapped(&self.page, size.columns);
+        let (lines, foot) = self.view.of(&lines, ends);
         let lines: String = lines.iter().map(|line| format!("{line}{ERASE_LINE}\r\n")).collect();
         draw(&format!("{}{lines}{ERASE_BELOW}{foot}", to_row(1)))
     }
 
-    /// The wish behind a pressed key. It waits a little for a key.
-    fn wish(&mut self) -> Option<Wish> {
+    /// The wishes behind the pressed keys. It waits a little for a key.
+    fn wishes(&mut self) -> Vec<Wish> {
         match self.terminal.keys(KEY_WAIT) {
-            Ok(keys) => keys.into_iter().find_map(wish),
+            Ok(keys) => keys.into_iter().filter_map(wish).collect(),
             // Without a terminal there is nobody to show anything to.
-            Err(_) => Some(Wish::End),
+            Err(_) => vec![Wish::End],
         }
     }
 }
@@ -221,7 +247,7 @@ mod tests {
 
     #[test]
     fn a_page_that_is_longer_than_the_screen_is_scrolled() {
-        let lines = |count: u32| Page::text(&(1..=count).map(|n| format!("line {n}\n")).collect::<String>());
+        let lines = |count: u32| (1..=count).map(|n| format!("line {n}")).collect::<Vec<_>>();
         let page = lines(40);
         let mut view = View { above: 0, room: 23 };
         let mut seen = |scroll: Scroll| {
@@ -248,7 +274,30 @@ mod tests {
         // A page that has become shorter is shown whole, or so that its last line is the last one shown.
         let mut view = View { above: 17, room: 23 };
         assert_eq!(view.of(&lines(25), "q ends").0[0], "line 3");
-        assert_eq!(view.of(&lines(2), "q ends"), (vec!["line 1", "line 2"], "q ends".to_owned()));
+        assert_eq!(view.of(&lines(2), "q ends"), (&lines(2)[..], "q ends".to_owned()));
         assert_eq!(View::default().of(&lines(1), "q ends").0.len(), 0, "there is no room");
+    }
+    #[test]
+    fn a_long_line_goes_on_below_its_text() {
+        let page =
+            Page::text("state     SHUT DOWN: the ADC is out of range\nabcdefghijklmnopqrstuvwxyz0123456789\n\nshort\n");
+        let rows = wrapped(&page, 24);
+        let wanted = [
+            "state     SHUT DOWN: the",
+            "          ADC is out of",
+            "          range",
+            "abcdefghijklmnopqrstuvwx",
+            "          yz0123456789",
+            "",
+            "short",
+        ];
+        assert_eq!(rows, wanted);
+        assert_eq!(wrapped(&page, 200).len(), 4);
+        for columns in 0..60 {
+            let rows = wrapped(&page, columns);
+            let letters = |text: &str| text.chars().filter(|c| *c != ' ').collect::<String>();
+            assert_eq!(letters(&rows.concat()), letters(&page.lines().collect::<String>()), "{columns}");
+            assert!(rows.iter().all(|row| row.chars().count() <= columns.max(1)), "{columns} {rows:?}");
+        }
     }
 }

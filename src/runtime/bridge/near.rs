@@ -47,11 +47,12 @@ pub(crate) fn link(link: &Path, target: Target) -> Result<(), Trouble> {
     // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
     let mut signals = Signals::new().map_err(no_room)?;
     let notify = Notify::from_env()?;
-    let pty = open(link)?;
+    // The host runs as the same user.
+    let pty = Pty::open(link, &Access { mode: 0o600, group: Some(getegid().to_string()) })?;
     info!("serving on {} ({}), by ssh to {}", link.display(), pty.detail(), target.host);
     let mut near = Near {
         link: link.to_owned(),
-        pty: Some(pty),
+        pty,
         target,
         notify,
         is_attached: false,
@@ -79,11 +80,6 @@ pub(crate) fn link(link: &Path, target: Target) -> Result<(), Trouble> {
     }
 }
 
-/// The host runs as the same user.
-fn open(link: &Path) -> Result<Pty, Trouble> {
-    Pty::open(link, &Access { mode: 0o600, group: Some(getegid().to_string()) })
-}
-
 /// The connection to the far end.
 enum State {
     /// There is none. When to try again.
@@ -96,8 +92,7 @@ enum State {
 
 struct Near {
     link: PathBuf,
-    /// `None` only while it is replaced.
-    pty: Option<Pty>,
+    pty: Pty,
     target: Target,
     notify: Notify,
     is_attached: bool,
@@ -144,16 +139,17 @@ impl Near {
         if now >= self.report_at {
             self.report();
         }
-        let Some(pty) = &mut self.pty else { return Ok(()) };
+        self.pty.restore();
+        let pty = &mut self.pty;
         self.to_host.drain(|bytes| pty.write(bytes)).map_err(|error| lost_pty(&self.link, error))
     }
 
     /// Waits for something to do, and takes in what has come. True if there is a signal.
     fn wait(&mut self, signal: BorrowedFd<'_>) -> Result<bool, Trouble> {
         let flag = |is_wanted: bool, flag| if is_wanted { flag } else { PollFlags::empty() };
-        let Some(pty) = &self.pty else { return Ok(false) };
+        let pty = &self.pty;
         let mut fds = vec![PollFd::new(signal, PollFlags::POLLIN)];
-        let mut due = self.report_at;
+        let mut due = pty.due().map_or(self.report_at, |at| at.min(self.report_at));
         let mut takes_from_host = false;
         match &mut self.state {
             State::Waiting { until } => due = due.min(*until),
@@ -218,9 +214,9 @@ impl Near {
     /// Reads the host's bytes, if the connection is up. `hung_up`: the host has gone.
     fn hear_host(&mut self, hung_up: bool) -> Result<(), Trouble> {
         let about = |error: io::Error| lost_pty(&self.link, error);
-        let Some(pty) = &mut self.pty else { return Ok(()) };
+        let pty = &mut self.pty;
         if !self.is_attached {
-            self.is_attached = pty.meet_host().map_err(about)?;
+            self.is_attached = pty.meet_host();
             if self.is_attached {
                 info!("host attached");
                 self.report_at = monotonic() + REPORT_EVERY;
@@ -257,27 +253,24 @@ impl Near {
         }
         // What the host wrote before it went comes first.
         if hung_up && bytes == 0 && self.is_attached {
-            self.part()?;
+            self.part();
         }
         Ok(())
     }
 
     /// The host is gone. The far end has to see that, so the connection ends, and the next one begins.
-    fn part(&mut self) -> Result<(), Trouble> {
+    fn part(&mut self) {
         info!("host gone");
         self.report();
         self.report_at = Duration::MAX;
         self.is_attached = false;
         self.to_host.clear();
-        if let Some(pty) = &mut self.pty {
-            pty.part_from_host().map_err(|error| lost_pty(&self.link, error))?;
-        }
+        self.pty.part_from_host();
         if let State::Up { .. } = self.state
             && let State::Up { ssh } = std::mem::replace(&mut self.state, State::Waiting { until: Duration::ZERO })
         {
             ssh.end();
         }
-        Ok(())
     }
 
     /// Reads what the far end has sent.
@@ -317,9 +310,7 @@ impl Near {
         let state = std::mem::replace(&mut self.state, State::Waiting { until: Duration::ZERO });
         let was_up = matches!(state, State::Up { .. });
         if was_up && self.is_attached {
-            // The kernel hangs up for the host when the last of our ends is closed.
-            self.pty = None;
-            self.pty = Some(open(&self.link)?);
+            self.pty.replace()?;
             self.is_attached = false;
             self.report();
             self.report_at = Duration::MAX;

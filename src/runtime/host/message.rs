@@ -99,7 +99,7 @@ impl Answer {
         assert!(self.lines.len() <= LINES_MAX);
         let checkout = self.host.iter().filter_map(|host| host.checkout.as_ref());
         for text in self.lines.iter().map(|line| &line.text).chain(checkout) {
-            assert!(!text.contains(char::is_control) && text.chars().count() <= LINE_CHARS_MAX);
+            assert!(!text.contains(crate::foreign::is_unseen) && text.chars().count() <= LINE_CHARS_MAX);
         }
         let commit = self.host.iter().find_map(|host| host.commit.as_ref());
         assert!(commit.is_none_or(|commit| commit.len() <= 40 && commit.bytes().all(|b| b.is_ascii_hexdigit())));

@@ -135,8 +135,11 @@ impl HostFinder {
         Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
     }
 
-    /// Asks for the dialect of the host that came just now.
-    pub(super) fn ask(&mut self) {
+    /// Asks for the dialect of the host that came just now, on the terminal `device`.
+    pub(super) fn ask(&mut self, device: Option<&Path>) {
+        if let Some(Ok(terminal)) = device.map(Terminal::of) {
+            self.terminal = terminal;
+        }
         self.asked = self.asked.wrapping_add(1);
         self.board.found(None);
         let question = Question { number: self.asked, terminal: self.terminal };

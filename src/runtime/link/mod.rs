@@ -16,7 +16,7 @@ use pinion_firmware::trouble::Trouble;
 pub mod can;
 pub(super) mod pty;
 mod serial;
-mod stdio;
+pub(super) mod stdio;
 
 use can::{CanBus, CanbusUuid};
 use pty::{Access, Pty};
@@ -71,8 +71,8 @@ pub(super) trait Link {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize>;
 
     /// Call this when bytes came while no host was there. False: their writer has gone already.
-    fn meet_host(&mut self) -> io::Result<bool> {
-        Ok(true)
+    fn meet_host(&mut self) -> bool {
+        true
     }
 
     /// How long a host that is there may be silent. klippy asks for the time each second. `None`: the kernel tells when
@@ -82,9 +82,7 @@ pub(super) trait Link {
     }
 
     /// The host is gone. Bytes that it has not read are dropped.
-    fn part_from_host(&mut self) -> io::Result<()> {
-        Ok(())
-    }
+    fn part_from_host(&mut self) {}
 
     /// What another program on the same wire has done, if it must stop the MCU.
     fn intrusion(&mut self) -> Option<pinion_firmware::shutdown::Shutdown> {

@@ -3,22 +3,24 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, chown, symlink};
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::Duration;
 
 use log::{info, warn};
 use nix::errno::Errno;
-use nix::fcntl::{FcntlArg, FdFlag, OFlag, fcntl};
+use nix::fcntl::{FcntlArg, FdFlag, Flock, FlockArg, OFlag, fcntl};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::pty::{OpenptyResult, openpty};
-use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
+use nix::pty::openpty;
+use nix::sys::termios::{FlowArg, FlushArg, SetArg, Termios, cfmakeraw, tcflow, tcflush, tcgetattr, tcsetattr};
 use nix::unistd::{geteuid, read, ttyname, write};
 
 use pinion_firmware::trouble::Trouble;
+use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
 use super::super::place::Place;
@@ -31,6 +33,12 @@ use super::{Heard, Link};
 const TMP: &str = "/tmp";
 /// The stop command of Klipper's own service writes this to the link's path, even if no program serves there.
 const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
+/// How often the terminal is restored while no host is there. No event tells that a client has changed it.
+const RESTORE_EVERY: Duration = Duration::from_secs(1);
+/// How long to wait for another program that serves a link in the same folder. Everybody may lock that folder.
+const TURN_MAX: Duration = Duration::from_secs(3);
+/// How often to look for the end of that program's turn.
+const TURN_LOOK: Duration = Duration::from_millis(10);
 
 /// A terminal that a host finds by a symbolic link.
 ///
@@ -41,6 +49,11 @@ pub(in crate::runtime) struct Pty {
     master: OwnedFd,
     /// Our own slave end, open while no host is there.
     slave: Option<OwnedFd>,
+    /// The terminal's settings before a client changed them.
+    settings: Termios,
+    /// When to restore the terminal for the next host (CLOCK_MONOTONIC). `None` while a host is there.
+    restore_at: Option<Duration>,
+    access: Access,
     device: PathBuf,
     symlink: PathBuf,
 }
@@ -62,30 +75,106 @@ impl Pty {
     ///
     /// The path is taken, the group is not this user's, or the kernel has no terminal.
     pub(in crate::runtime) fn open(symlink: &Path, access: &Access) -> Result<Pty, Trouble> {
+        // Of several programs that start at once, the first one serves the link. The others find it served.
+        let _turn = turn(symlink);
         if let Some(served) = served(symlink) {
             return Err(format!("{served}, or choose another path with -I").into());
         }
-        let opened = Pty::opened().map_err(|error| {
-            refused("no pseudo terminal can be opened", error).remedy("mount /dev/pts, or raise LimitNOFILE")
-        });
-        let (pty, device) = opened?;
-        grant(&device, access)?;
-        place_symlink(&device, symlink)?;
-        Ok(Pty { master: pty.master, slave: Some(pty.slave), device, symlink: symlink.to_owned() })
+        let pty = Pty::unlinked(symlink, access)?;
+        place_symlink(&pty.device, symlink)?;
+        Ok(pty)
     }
 
-    /// A raw terminal and the path of its slave end.
-    fn opened() -> nix::Result<(OpenptyResult, PathBuf)> {
+    /// A raw terminal to which no symbolic link leads yet.
+    fn unlinked(symlink: &Path, access: &Access) -> Result<Pty, Trouble> {
+        let pty = Pty::try_unlinked(symlink, access).map_err(|error| {
+            refused("no pseudo terminal can be opened", error).remedy("mount /dev/pts, or raise LimitNOFILE")
+        })?;
+        grant(&pty.device, access)?;
+        Ok(pty)
+    }
+
+    fn try_unlinked(symlink: &Path, access: &Access) -> nix::Result<Pty> {
         let pty = openpty(None, None)?;
-        let mut raw = tcgetattr(&pty.slave)?;
-        cfmakeraw(&mut raw);
-        tcsetattr(&pty.slave, SetArg::TCSANOW, &raw)?;
+        let mut settings = tcgetattr(&pty.slave)?;
+        cfmakeraw(&mut settings);
+        tcsetattr(&pty.slave, SetArg::TCSANOW, &settings)?;
         for fd in [&pty.master, &pty.slave] {
             fcntl(fd, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC))?;
         }
         fcntl(&pty.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
-        let device = ttyname(&pty.slave)?;
-        Ok((pty, device))
+        Ok(Pty {
+            device: ttyname(&pty.slave)?,
+            master: pty.master,
+            slave: Some(pty.slave),
+            settings,
+            restore_at: Some(monotonic() + RESTORE_EVERY),
+            access: access.clone(),
+            symlink: symlink.to_owned(),
+        })
+    }
+
+    /// Restores the terminal, if that is due. A client may leave it closed to others (TIOCEXCL), stopped (tcflow(3)) or
+    /// with other settings. Then the next host could not open or use it.
+    pub(in crate::runtime) fn restore(&mut self) {
+        if self.restore_at.is_none_or(|at| monotonic() < at) {
+            return;
+        }
+        self.restore_at = Some(monotonic() + RESTORE_EVERY);
+        let Err(error) = self.try_restore() else { return };
+        let left = self.device.display().to_string();
+        match self.replace() {
+            Ok(()) => warn!(
+                "{left} cannot be used any more: {error}: {} leads to {} now, and hosts find it there",
+                self.symlink.display(),
+                self.device.display()
+            ),
+            Err(trouble) => warn!("{left} cannot be used any more: {error}: {trouble} (tried again until it works)"),
+        }
+    }
+
+    fn try_restore(&mut self) -> io::Result<()> {
+        let slave = match self.slave.take() {
+            Some(slave) => slave,
+            None => sys::pty_slave(self.master.as_fd())?,
+        };
+        sys::make_shared(&slave)?;
+        sys::use_usual_discipline(&slave)?;
+        tcflow(&slave, FlowArg::TCOON)?;
+        tcsetattr(&slave, SetArg::TCSANOW, &self.settings)?;
+        self.slave = Some(slave);
+        Ok(())
+    }
+
+    /// Puts a new terminal in place of this one. The kernel hangs up for everybody who has the old one open.
+    pub(in crate::runtime) fn replace(&mut self) -> Result<(), Trouble> {
+        let fresh = Pty::unlinked(&self.symlink, &self.access)?;
+        if self.is_linked() {
+            place_symlink(&fresh.device, &self.symlink)?;
+        }
+        *self = fresh;
+        Ok(())
+    }
+
+    /// Whether the link leads to this terminal. Another program may have put its own link there since.
+    fn is_linked(&self) -> bool {
+        fs::read_link(&self.symlink).is_ok_and(|target| target == self.device)
+    }
+}
+
+/// Waits until no other program is about to serve a link in this folder. It gives up when that takes too long, because
+/// another user may hold the lock.
+fn turn(symlink: &Path) -> Option<Flock<File>> {
+    let folder = symlink.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut folder = File::open(folder).ok()?;
+    let until = monotonic() + TURN_MAX;
+    loop {
+        match Flock::lock(folder, FlockArg::LockExclusiveNonblock) {
+            Ok(turn) => return Some(turn),
+            Err((back, Errno::EWOULDBLOCK | Errno::EINTR)) if monotonic() < until => folder = back,
+            Err(_) => return None,
+        }
+        thread::sleep(TURN_LOOK);
     }
 }
 
@@ -103,13 +192,19 @@ impl Link for Pty {
     }
 
     fn event(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.master.as_fd())
+        // Without a host and without our own slave end it hangs up all the time.
+        (self.restore_at.is_none() || self.slave.is_some()).then(|| self.master.as_fd())
+    }
+
+    fn due(&self) -> Option<Duration> {
+        self.restore_at
     }
 
     fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard> {
         if hung_up {
             return Ok(Heard::Gone);
         }
+        self.restore();
         match read(&self.master, buffer) {
             Ok(len) => Ok(Heard::Bytes(len)),
             // The kernel answers EIO when the host has gone and all its bytes have been read.
@@ -128,15 +223,15 @@ impl Link for Pty {
 
     /// It closes our slave end, so that the master hangs up when the host goes. It returns false if the host has gone
     /// already, as `echo` in a shell does.
-    fn meet_host(&mut self) -> io::Result<bool> {
+    fn meet_host(&mut self) -> bool {
         self.slave = None;
+        self.restore_at = None;
         let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
-        poll(&mut fds, PollTimeout::ZERO)?;
-        let is_there = !fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP));
-        if !is_there {
-            self.part_from_host()?;
+        let is_gone = poll(&mut fds, PollTimeout::ZERO).is_ok() && fds[0].any().unwrap_or(true);
+        if is_gone {
+            self.part_from_host();
         }
-        Ok(is_there)
+        !is_gone
     }
 
     fn silence_max(&self) -> Option<Duration> {
@@ -144,19 +239,19 @@ impl Link for Pty {
     }
 
     /// It opens our slave end again, so that the master no longer hangs up.
-    fn part_from_host(&mut self) -> io::Result<()> {
-        let slave = sys::pty_slave(self.master.as_fd())?;
-        // If this fails, the next host reads some blocks that were meant for this one, and skips them.
-        let _ = tcflush(&slave, FlushArg::TCIFLUSH);
-        self.slave = Some(slave);
-        Ok(())
+    fn part_from_host(&mut self) {
+        self.restore_at = Some(Duration::ZERO);
+        self.restore();
+        if let Some(slave) = &self.slave {
+            // If this fails, the next host reads some blocks that were meant for this one, and skips them.
+            let _ = tcflush(slave, FlushArg::TCIFLUSH);
+        }
     }
 }
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        // Another program may have put its own link there since. That link must stay.
-        if fs::read_link(&self.symlink).is_ok_and(|target| target == self.device) {
+        if self.is_linked() {
             let _ = fs::remove_file(&self.symlink);
         }
     }
@@ -243,7 +338,6 @@ fn is_left_over(path: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::File;
     use std::io::Write;
 
     /// A terminal, and how a host opens it.
@@ -268,12 +362,12 @@ mod tests {
             drop(open());
         }
         let (klippy, echo) = (open(), open());
-        assert!(pty.meet_host().unwrap());
+        assert!(pty.meet_host());
         drop(klippy);
         assert!(!hangs_up(&pty));
         drop(echo);
         assert!(hangs_up(&pty));
-        pty.part_from_host().unwrap();
+        pty.part_from_host();
         assert!(!hangs_up(&pty));
     }
 
@@ -322,7 +416,7 @@ mod tests {
     fn who_wrote_and_left_is_heard_and_is_not_there() {
         let (_folder, mut pty, open) = terminal();
         open().write_all(b"FORCE_SHUTDOWN\n").unwrap();
-        assert!(!pty.meet_host().unwrap());
+        assert!(!pty.meet_host());
         let mut heard = [0; 64];
         let Heard::Bytes(len) = pty.read(&mut heard, false).unwrap() else { panic!() };
         assert_eq!(heard[..len], *b"FORCE_SHUTDOWN\n");
@@ -334,7 +428,7 @@ mod tests {
         let (_folder, mut pty, open) = terminal();
         let mut host = open();
         host.write_all(b"?").unwrap();
-        assert!(pty.meet_host().unwrap());
+        assert!(pty.meet_host());
         pty.write(b"for the last one").unwrap();
         drop(host);
         let mut heard = [0; 64];
@@ -344,7 +438,7 @@ mod tests {
             Heard::Bytes(0),
             "a terminal that hung up has nothing to read"
         );
-        pty.part_from_host().unwrap();
+        pty.part_from_host();
         host = open();
         pty.write(b"for this one").unwrap();
         let len = host.read(&mut heard).unwrap();

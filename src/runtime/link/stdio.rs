@@ -5,24 +5,63 @@
 
 use std::io::{self, IsTerminal};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::{Mutex, PoisonError};
+use std::thread;
 use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::stat::fstat;
-use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
+use nix::sys::termios::{SetArg, Termios, cfmakeraw, tcgetattr, tcsetattr};
 use nix::unistd::{read, write};
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::emulate_default_handler;
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
-use super::super::refused;
+use super::super::signals;
+use super::super::{refused, started};
 use super::{Heard, Link};
 
 /// When to try again if the output has no room. A pipe has room for 64 KiB, so this is rare.
 const FULL_PAUSE: Duration = Duration::from_millis(1);
 
-/// Standard input and output.
+/// Standard input and output as they were. Other programs may use them after this one.
+static BEFORE: Mutex<Vec<Before>> = Mutex::new(Vec::new());
+
+struct Before {
+    fd: OwnedFd,
+    flags: OFlag,
+    /// `None` if it is no terminal.
+    settings: Option<Termios>,
+}
+
+/// Gives standard input and output back as they were. Does nothing if no link has changed them.
+pub(crate) fn give_back() {
+    let before = std::mem::take(&mut *BEFORE.lock().unwrap_or_else(PoisonError::into_inner));
+    // In reverse order, because both may be one file.
+    for Before { fd, flags, settings } in before.into_iter().rev() {
+        // If this fails, the terminal is gone.
+        let _ = fcntl(&fd, FcntlArg::F_SETFL(flags));
+        let _ = settings.map(|settings| tcsetattr(&fd, SetArg::TCSANOW, &settings));
+    }
+}
+
+/// Starts a thread that gives them back if a signal ends the program at once.
+fn give_back_at_signal() -> Result<(), Trouble> {
+    let thread = Signals::new(signals::deadly()).and_then(|mut deadly| {
+        thread::Builder::new().name("stdio".into()).spawn(move || {
+            for signal in deadly.forever() {
+                give_back();
+                let _ = emulate_default_handler(signal);
+            }
+        })
+    });
+    started(thread).map(drop)
+}
+
+/// Standard input and output. When this is dropped, they are given back.
 pub(super) struct Stdio {
     input: OwnedFd,
     output: OwnedFd,
@@ -49,6 +88,7 @@ impl Stdio {
                 full_until: None,
             })
         };
+        give_back_at_signal()?;
         let stdio = opened().and_then(|stdio| stdio.prepare().map(|()| stdio));
         stdio.map_err(|error| {
             refused("standard input and output cannot be used", error).remedy("let ssh or socat start Pinion")
@@ -57,14 +97,23 @@ impl Stdio {
 
     fn prepare(&self) -> io::Result<()> {
         for fd in [&self.input, &self.output] {
-            if let Ok(mut settings) = tcgetattr(fd) {
+            let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
+            let settings = tcgetattr(fd).ok();
+            let before = Before { fd: fd.try_clone()?, flags, settings: settings.clone() };
+            BEFORE.lock().unwrap_or_else(PoisonError::into_inner).push(before);
+            if let Some(mut settings) = settings {
                 cfmakeraw(&mut settings);
                 tcsetattr(fd, SetArg::TCSANOW, &settings)?;
             }
-            let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
             fcntl(fd, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK))?;
         }
         Ok(())
+    }
+}
+
+impl Drop for Stdio {
+    fn drop(&mut self) {
+        give_back();
     }
 }
 

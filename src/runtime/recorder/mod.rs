@@ -8,14 +8,15 @@
 mod computer;
 mod edges;
 mod memory;
+mod pace;
 mod tape;
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, Permissions};
+use std::fs::{self, Permissions};
 use std::io::{self, PipeReader, PipeWriter};
 use std::os::fd::AsFd;
 use std::os::unix::fs::PermissionsExt;
-use std::os::unix::net::{UnixListener, UnixStream};
+use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -30,6 +31,7 @@ use rtrb::{Consumer, RingBuffer};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::Dialect;
+use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic, poll_timeout, wait_until};
@@ -40,25 +42,28 @@ use crate::trace::event::{Event, Watched};
 use crate::trace::file::{End, Head, Names, SSH, Thread, Trace};
 use crate::trace::folder;
 use crate::trace::ring::Writer;
-use crate::trace::verdict::verdict;
+use crate::trace::verdict::{Culprit, Verdict, verdict};
 use crate::{FIRMWARE, status};
 
 use super::link::LinkName;
-use super::status::Place;
+use super::status::{Manners, Place, serve_on};
 
 use computer::Computer;
 use edges::{EdgeBoard, EdgeTape};
 use memory::Memory;
+use pace::Pace;
 use tape::News;
 pub use tape::Sleep;
 pub(super) use tape::Tape;
 
 /// How long the recorder waits after a stop, so that the events of all threads are there.
 const SETTLE: Duration = Duration::from_millis(20);
-/// Highest number of files that are kept for an instance.
-const KEPT_MAX: usize = 10;
-/// How long a client may take to read a recording.
-const CLIENT_LIMIT: Duration = Duration::from_secs(5);
+/// Each answer to clients copies all rings, so there are few.
+const CLIENTS: Manners = Manners { pause: Duration::from_millis(500), limit: Duration::from_secs(30) };
+/// A host that stops the MCU again and again must not keep the disk busy.
+const RECORDINGS: Pace = Pace::new(5, Duration::from_secs(60));
+/// The same for stops that the host asked for. Only the last of them stays.
+const ASKED_RECORDINGS: Pace = Pace::new(1, Duration::from_secs(60));
 /// How long the end of the program waits until the last stop is kept.
 const END_LIMIT: Duration = Duration::from_secs(1);
 /// How many news of the core may wait.
@@ -112,8 +117,13 @@ impl Recording {
     pub(super) fn status(&self) -> status::Recorder {
         status::Recorder {
             bytes: self.memory.bytes(),
-            folder: self.folders.first().map(|folder| folder.display().to_string()),
+            folder: self.folder().map(|folder| folder.display().to_string()),
         }
+    }
+
+    /// The folder of the next file, as far as that is known before.
+    fn folder(&self) -> Option<&PathBuf> {
+        self.folders.iter().find(|path| folder::is_ours(path))
     }
 
     /// The writer of a worker.
@@ -150,17 +160,32 @@ impl Recording {
         Trace { head, threads: self.memory.rings().map(thread).collect() }
     }
 
-    /// Keeps a trace in a file, and logs who was late.
-    fn keep(&self, trace: &Trace) {
+    /// Keeps the trace of a stop in a file, and logs who was late. `paces` bound how often.
+    fn keep_stop(&self, trace: &Trace, paces: &mut Paces) {
         if self.folders.is_empty() {
             return;
         }
         let found = verdict(trace);
-        match self.write(trace) {
+        let is_asked = is_asked(trace, &found);
+        let (pace, kind) = match is_asked {
+            true => (&mut paces.asked, "such a stop"),
+            false => (&mut paces.others, "a stop"),
+        };
+        if pace.admits(monotonic()) {
+            self.keep(trace, &found, is_asked);
+        } else {
+            info!("{} (no trace: {kind} was recorded less than a minute before)", found.text);
+        }
+    }
+
+    fn keep(&self, trace: &Trace, found: &Verdict, is_asked: bool) {
+        match self.write(trace, is_asked) {
             Ok(path) => info!("{} (pinion trace {})", found.text, path.display()),
             Err(error) => {
                 info!("{}", found.text);
-                warn!("the trace of this stop is not kept: {error}: make room on the disk, or the folder");
+                warn!(
+                    "the trace of this stop is not kept: {error}: make room on the disk, or a folder of this user (XDG_STATE_HOME)"
+                );
             }
         }
     }
@@ -169,15 +194,16 @@ impl Recording {
     pub(super) fn keep_of_the_dead(&self, end: End) {
         let trace = self.trace(end, self.clock.now());
         let mut events = trace.threads.iter().flat_map(|thread| &thread.events);
-        if events.any(|(_, event)| matches!(event, Event::Configured | Event::BlockIn(_))) {
-            self.keep(&trace);
+        let is_used = events.any(|(_, event)| matches!(event, Event::Configured | Event::BlockIn(_)));
+        if is_used && !self.folders.is_empty() {
+            self.keep(&trace, &verdict(&trace), false);
         }
     }
 
-    fn write(&self, trace: &Trace) -> io::Result<PathBuf> {
+    fn write(&self, trace: &Trace, is_asked: bool) -> io::Result<PathBuf> {
         let mut errors = Vec::new();
         for folder in &self.folders {
-            match self.write_into(folder, trace) {
+            match self.write_into(folder, trace, is_asked) {
                 Ok(path) => return Ok(path),
                 Err(error) => errors.push(format!("{}: {error}", folder.display())),
             }
@@ -185,25 +211,36 @@ impl Recording {
         Err(io::Error::other(errors.join("; ")))
     }
 
-    fn write_into(&self, folder: &Path, trace: &Trace) -> io::Result<PathBuf> {
-        folder::make(folder)?;
-        let name = folder::name_of(&self.link);
-        let path = folder::new_file(folder, &name, trace.head.utc_ms);
+    fn write_into(&self, path: &Path, trace: &Trace, is_asked: bool) -> io::Result<PathBuf> {
+        let folder = folder::open(path)?;
+        let (here, instance) = (folder.at(""), folder::name_of(&self.link));
+        let name = folder::new_name(&here, &instance, trace.head.utc_ms, is_asked);
         // A rename puts only a whole file in place. A full disk or a power cut leaves none.
-        let fresh = folder.join(format!(".{name}.{}", std::process::id()));
-        let written = File::create(&fresh).and_then(|file| {
+        let fresh = format!(".{instance}.{}", std::process::id());
+        let written = folder.create(&fresh).and_then(|file| {
             // Everybody may read when the MCU moved which line.
             file.set_permissions(Permissions::from_mode(0o644))?;
             trace.write(file)
         });
-        written.and_then(|()| fs::rename(&fresh, &path)).inspect_err(|_| drop(fs::remove_file(&fresh)))?;
-        // After the clock was set back, the others seem newer.
-        let others = folder::kept(folder, &name).into_iter().filter(|other| *other != path);
-        for old in others.skip(KEPT_MAX - 1) {
+        let (fresh, placed) = (folder.at(&fresh), folder.at(&name));
+        written.and_then(|()| fs::rename(&fresh, placed)).inspect_err(|_| drop(fs::remove_file(&fresh)))?;
+        for old in folder::surplus(&here, &instance) {
             let _ = fs::remove_file(old);
         }
-        Ok(path)
+        Ok(path.join(name))
     }
+}
+
+/// Whether the host had asked for the stop, and nobody was late.
+fn is_asked(trace: &Trace, found: &Verdict) -> bool {
+    found.culprit == Culprit::Nobody
+        && matches!(&trace.head.end, End::Shutdown { reason, .. } if reason == reason::COMMAND_REQUEST.text())
+}
+
+/// How often files are made.
+struct Paces {
+    asked: Pace,
+    others: Pace,
 }
 
 /// The span from a time to a later one.
@@ -217,7 +254,7 @@ fn locked(names: &Mutex<Names>) -> MutexGuard<'_, Names> {
 }
 
 /// The names of the host's commands.
-fn commands(dialect: &Dialect) -> BTreeMap<u16, String> {
+fn commands(dialect: &Dialect) -> BTreeMap<i16, String> {
     let commands = dialect.dictionary().commands.iter();
     let named = commands.filter_map(|(form, id)| Some((id.as_i64()?.try_into().ok()?, format::name(form).to_owned())));
     named.collect()
@@ -229,7 +266,8 @@ pub(super) struct Recorder {
     names: Arc<Mutex<Names>>,
     wake: Arc<EventFd>,
     news: Option<Consumer<News>>,
-    thread: Option<(PipeWriter, JoinHandle<()>, Option<Place>)>,
+    thread: Option<(PipeWriter, JoinHandle<()>)>,
+    clients: Option<(PipeWriter, Place)>,
 }
 
 impl Recorder {
@@ -240,7 +278,7 @@ impl Recorder {
         let writers = recording.memory.core().ok_or_else(|| io::Error::other("the recording has another core"))?;
         recording.memory.touch();
         let tape = Tape::new(writers, producer, wake.clone());
-        Ok((Recorder { recording, names: Arc::default(), wake, news: Some(news), thread: None }, tape))
+        Ok((Recorder { recording, names: Arc::default(), wake, news: Some(news), thread: None, clients: None }, tape))
     }
 
     /// Names the commands of the host's dialect.
@@ -268,18 +306,29 @@ impl Recorder {
         self.recording.memory.link()
     }
 
-    /// Starts the thread. The calling thread is the link. `socket` is where `pinion trace --live` asks.
+    /// Starts the thread. The calling thread is the link. `socket` is where `pinion trace --live` asks. Its clients have a
+    /// thread of their own: they must not keep the recorder from its samples, nor from a stop.
     pub(super) fn start(&mut self, socket: Option<(UnixListener, Place)>) -> io::Result<()> {
         let Some(news) = self.news.take() else { return Ok(()) };
+        if let Some(folder) = self.recording.folder() {
+            info!("traces in {}", folder.display());
+        }
         let (end, alive) = io::pipe()?;
-        let (listener, place) = socket.unzip();
         let link = gettid();
         let (recording, names, wake) = (self.recording.clone(), self.names.clone(), self.wake.clone());
         let thread = thread::Builder::new().name("recorder".into()).spawn(move || {
-            let keeper = Keeper { recording, names, wake, news, listener, end };
-            keeper.run(link);
+            let paces = Paces { asked: ASKED_RECORDINGS, others: RECORDINGS };
+            Keeper { recording, names, wake, news, paces, end }.run(link);
         })?;
-        self.thread = Some((alive, thread, place));
+        self.thread = Some((alive, thread));
+        if let Some((listener, place)) = socket {
+            let recording = self.recording.clone();
+            let answer = move || {
+                let mut bytes = Vec::new();
+                recording.trace(End::Asked, recording.clock.now()).write(&mut bytes).ok().map(|()| bytes)
+            };
+            self.clients = Some((serve_on(listener, "trace", CLIENTS, answer)?, place));
+        }
         Ok(())
     }
 }
@@ -287,7 +336,8 @@ impl Recorder {
 impl Drop for Recorder {
     /// Lets the thread keep the last stop.
     fn drop(&mut self) {
-        let Some((alive, thread, _place)) = self.thread.take() else { return };
+        drop(self.clients.take());
+        let Some((alive, thread)) = self.thread.take() else { return };
         drop(alive);
         wait_until(monotonic() + END_LIMIT, || thread.is_finished());
     }
@@ -299,7 +349,7 @@ struct Keeper {
     names: Arc<Mutex<Names>>,
     wake: Arc<EventFd>,
     news: Consumer<News>,
-    listener: Option<UnixListener>,
+    paces: Paces,
     end: PipeReader,
 }
 
@@ -329,27 +379,20 @@ impl Keeper {
                         // The accounts at the stop tell more than those before it.
                         next = monotonic() + computer.look(self.recording.clock.now(), true);
                         let end = End::Shutdown { reason: reason.to_owned(), trouble };
-                        self.recording.keep(&self.recording.trace(end, at));
+                        self.recording.keep_stop(&self.recording.trace(end, at), &mut self.paces);
                     }
                 }
             }
-            let listener = self.listener.as_ref().map_or(self.end.as_fd(), AsFd::as_fd);
-            let mut fds = [
-                PollFd::new(self.end.as_fd(), PollFlags::empty()),
-                PollFd::new(self.wake.as_fd(), PollFlags::POLLIN),
-                PollFd::new(listener, PollFlags::POLLIN),
-            ];
+            let mut fds =
+                [PollFd::new(self.end.as_fd(), PollFlags::empty()), PollFd::new(self.wake.as_fd(), PollFlags::POLLIN)];
             let _ = poll(&mut fds, poll_timeout(next.saturating_sub(monotonic())));
-            let [ended, woken, asked] = fds.map(|fd| fd.any().unwrap_or(true));
+            let [ended, woken] = fds.map(|fd| fd.any().unwrap_or(true));
             if woken {
                 let _ = self.wake.read();
                 self.publish();
             }
             if ended && self.news.is_empty() {
                 return;
-            }
-            if asked && let Some(Ok((client, _))) = self.listener.as_ref().map(UnixListener::accept) {
-                self.give(client);
             }
         }
     }
@@ -359,37 +402,76 @@ impl Keeper {
         let names = locked(&self.names).clone();
         self.recording.memory.set_names(&names);
     }
-
-    /// Gives a client what is recorded.
-    fn give(&self, client: UnixStream) {
-        let trace = self.recording.trace(End::Asked, self.recording.clock.now());
-        // A client that does not read must not keep the thread.
-        let limited = client.set_nonblocking(false).and_then(|()| client.set_write_timeout(Some(CLIENT_LIMIT)));
-        let _ = limited.and_then(|()| trace.write(client));
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The clock of a computer may stand still, or be set back.
+    fn recording(folders: Vec<PathBuf>) -> Recording {
+        Recording::new(Monotonic::start(), Path::new("/tmp/klipper_host_test"), false, folders).unwrap()
+    }
+
+    fn names(folder: &Path) -> Vec<PathBuf> {
+        folder::kept(&[folder.to_owned()], "test")
+    }
+
+    /// The clock of a computer may stand still, be set back, or be wrong at first.
     #[test]
     fn each_stop_keeps_its_file_and_the_last_ten_stay() {
         let folder = tempfile::tempdir().unwrap();
-        let link = Path::new("/tmp/klipper_host_test");
-        let recording = Recording::new(Monotonic::start(), link, false, vec![folder.path().to_owned()]).unwrap();
+        let recording = recording(vec![folder.path().to_owned()]);
         let mut trace = recording.trace(End::Died, Clock::EPOCH);
-        trace.head.utc_ms = 1_795_357_574_999;
-        let mut written: Vec<PathBuf> = (0..KEPT_MAX + 2).map(|_| recording.write(&trace).unwrap()).collect();
+        let mut write = |utc_ms| {
+            trace.head.utc_ms = utc_ms;
+            recording.write(&trace, false).unwrap()
+        };
+        let mut written = vec![write(4_102_444_800_000)];
+        written.extend((0..11).map(|_| write(1_795_357_574_999)));
+        written.push(write(1_795_353_974_999));
         written.reverse();
-        written.truncate(KEPT_MAX);
-        assert_eq!(folder::kept(folder.path(), "test"), written);
-        trace.head.utc_ms -= 3_600_000;
-        let back = recording.write(&trace).unwrap();
-        written.truncate(KEPT_MAX - 1);
-        written.push(back);
-        assert_eq!(folder::kept(folder.path(), "test"), written);
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), KEPT_MAX);
+        written.truncate(10);
+        assert_eq!(names(folder.path()), written);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 10);
+        let mode = fs::metadata(&written[0]).unwrap().permissions().mode();
+        assert_eq!(mode & 0o7777, 0o644);
+    }
+
+    fn stop(recording: &Recording, reason: &str) -> Trace {
+        recording.trace(End::Shutdown { reason: reason.into(), trouble: "".into() }, Clock::EPOCH)
+    }
+
+    #[test]
+    fn a_host_that_stops_again_and_again_makes_few_files_and_removes_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let recording = recording(vec![folder.path().to_owned()]);
+        let mut paces = Paces { asked: ASKED_RECORDINGS, others: RECORDINGS };
+        recording.keep_stop(&stop(&recording, "ADC out of range"), &mut paces);
+        let first = names(folder.path());
+        for _ in 0..20 {
+            recording.keep_stop(&stop(&recording, reason::COMMAND_REQUEST.text()), &mut paces);
+        }
+        let both = names(folder.path());
+        assert_eq!(both.len(), 2, "{both:?}");
+        assert_eq!(both[1..], first);
+        (0..20).for_each(|_| recording.keep_stop(&stop(&recording, "ADC out of range"), &mut paces));
+        assert_eq!(names(folder.path()).len(), 1 + 5);
+    }
+
+    /// The second folder is the user's own.
+    #[test]
+    fn a_folder_of_another_user_gets_no_file() {
+        if !pinion_testkit::here::is_root() {
+            return;
+        }
+        let root = tempfile::tempdir().unwrap();
+        let (service, own) = (root.path().join("service"), root.path().join("own"));
+        fs::create_dir(&service).unwrap();
+        std::os::unix::fs::chown(&service, Some(65534), None).unwrap();
+        let recording = recording(vec![service.clone(), own.clone()]);
+        assert_eq!(recording.status().folder, Some(own.display().to_string()));
+        let path = recording.write(&recording.trace(End::Died, Clock::EPOCH), false).unwrap();
+        assert_eq!(names(&own), [path]);
+        assert_eq!(fs::read_dir(service).unwrap().count(), 0);
     }
 }

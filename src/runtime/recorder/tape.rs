@@ -121,7 +121,7 @@ impl Tape {
         if count == 0 {
             return;
         }
-        let id = Reader::new(payload).int().unwrap_or(0) as u16;
+        let id = Reader::new(payload).int().unwrap_or(0) as i16;
         self.recent.write(at, Event::Command { id, more: (count - 1).min(u8::MAX.into()) as u8 });
     }
 

@@ -22,6 +22,8 @@ use super::{Answer, Asker};
 pub(in crate::runtime) struct HostBoard {
     /// Whether a host has the terminal open. The link says so.
     attached: AtomicBool,
+    /// The terminal, or more about the link's place.
+    terminal: Mutex<String>,
     found: Mutex<Option<FoundHost>>,
 }
 
@@ -41,6 +43,14 @@ pub(in crate::runtime) struct FoundHost {
 impl HostBoard {
     pub(in crate::runtime) fn attach(&self, attached: bool) {
         self.attached.store(attached, Ordering::Relaxed);
+    }
+
+    pub(in crate::runtime) fn serve_on(&self, terminal: String) {
+        *self.terminal.lock().unwrap_or_else(PoisonError::into_inner) = terminal;
+    }
+
+    fn terminal(&self) -> String {
+        self.terminal.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     pub(in crate::runtime) fn found(&self, host: Option<FoundHost>) {
@@ -69,8 +79,6 @@ impl HostBoard {
 pub(in crate::runtime) struct Facts {
     /// Where the host finds the MCU.
     pub(in crate::runtime) link: String,
-    /// The terminal there, or more about that place.
-    pub(in crate::runtime) terminal: String,
     /// Description of the board.
     pub(in crate::runtime) board: String,
     /// Names of its pins.
@@ -111,7 +119,7 @@ impl Reporter {
             pid: std::process::id(),
             uptime_s: rounded(self.started.elapsed().as_secs_f64()),
             link: facts.link.clone(),
-            terminal: facts.terminal.clone(),
+            terminal: self.host.terminal(),
             board: facts.board.clone(),
             state: answer.map_or(State::Unknown, |answer| state(&answer.mcu)),
             host: self.host.host(),

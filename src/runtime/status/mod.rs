@@ -22,7 +22,7 @@ mod socket;
 
 pub(super) use document::{Facts, FoundHost, HostBoard};
 pub(crate) use socket::connect;
-pub(super) use socket::{Place, StatusSocket, open as open_socket};
+pub(super) use socket::{Manners, Place, StatusSocket, open as open_socket, serve_on};
 pub use socket::{socket_paths, trace_socket_paths};
 
 /// Longest wait for the core's answer. It is longer than the core's longest nap.

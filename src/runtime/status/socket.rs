@@ -3,10 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
+use std::collections::VecDeque;
+use std::ffi::OsString;
+use std::fs::{self, OpenOptions};
 use std::io::{self, PipeReader, PipeWriter, Write};
 use std::os::fd::{AsFd, AsRawFd};
-use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, chown};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt, PermissionsExt, chown};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,19 +16,35 @@ use std::thread;
 use std::time::Duration;
 
 use log::{info, warn};
+use nix::fcntl::OFlag;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
+use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr, bind, listen, socket};
+
+use pinion_linux::clock::{monotonic, poll_timeout};
 
 use crate::foreign::plain_json;
+use crate::own_folder::{OwnFolder, below};
 use crate::trace::folder::name_of;
 
+use super::super::sooner;
 use super::Asker;
 use super::document::{Facts, HostBoard, Reporter};
 
-/// Shortest time between two questions to the core, however many clients ask.
-const PAUSE: Duration = Duration::from_millis(50);
-/// Highest number of clients that are answered at once. Others wait in the kernel's queue.
+/// Shortest time between two questions to the core, however many clients ask, and how long a client may take to read.
+const MANNERS: Manners = Manners { pause: Duration::from_millis(50), limit: Duration::from_secs(5) };
+/// Highest number of clients that get one answer. Others wait in the kernel's queue.
 const CLIENTS_MAX: usize = 32;
+/// Highest number of answers that are being read. Another one drops the oldest, and its clients.
+const ANSWERS_MAX: usize = 4;
+
+/// How a socket treats its clients.
+#[derive(Clone, Copy)]
+pub(in crate::runtime) struct Manners {
+    /// Shortest time between two answers.
+    pub(in crate::runtime) pause: Duration,
+    /// How long a client may take to read its answer.
+    pub(in crate::runtime) limit: Duration,
+}
 
 /// The status's socket. When this is dropped, the socket is removed and its thread ends.
 pub(in crate::runtime) struct StatusSocket {
@@ -37,6 +55,8 @@ pub(in crate::runtime) struct StatusSocket {
 /// A socket's place in the file system. When this is dropped, the socket is removed.
 pub(in crate::runtime) struct Place {
     path: PathBuf,
+    folder: OwnFolder,
+    name: OsString,
     /// Device and inode of our own socket.
     id: (u64, u64),
 }
@@ -52,7 +72,14 @@ impl StatusSocket {
     ) -> Option<StatusSocket> {
         let (listener, place) = open(paths, terminal, |errors| warn!("pinion status will not be answered: {errors}"))?;
         info!("status on {}", place.path.display());
-        let served = serve_on(listener, Reporter::new(asker, facts, host));
+        let mut reporter = Reporter::new(asker, facts, host);
+        let served = serve_on(listener, "status", MANNERS, move || match serde_json::to_string(&reporter.status()) {
+            Ok(document) => Some(plain_json(&document).into_bytes()),
+            Err(error) => {
+                warn!("pinion status is not answered: {error}: this is a bug in Pinion, please report it");
+                None
+            }
+        });
         let started = served.inspect_err(|error| {
             warn!("pinion status will not be answered: no thread can be started: {error}: raise TasksMax or ulimit -u")
         });
@@ -62,8 +89,9 @@ impl StatusSocket {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        if fs::symlink_metadata(&self.path).is_ok_and(|found| (found.dev(), found.ino()) == self.id) {
-            let _ = fs::remove_file(&self.path);
+        let path = self.folder.at(&self.name);
+        if fs::symlink_metadata(&path).is_ok_and(|found| (found.dev(), found.ino()) == self.id) {
+            let _ = fs::remove_file(path);
         }
     }
 }
@@ -79,7 +107,7 @@ pub(in crate::runtime) fn open(
     let mut errors = Vec::new();
     for path in paths {
         match open_at(path, terminal) {
-            Ok((listener, id)) => return Some((listener, Place { path: path.clone(), id })),
+            Ok(opened) => return Some(opened),
             Err(error) => errors.push(format!("{}: {error}", path.display())),
         }
     }
@@ -110,13 +138,18 @@ pub fn trace_socket_paths(status: &[PathBuf]) -> Vec<PathBuf> {
     status.iter().map(|path| path.with_extension("trace")).collect()
 }
 
-/// Opens the socket at a path, and returns it with its device and inode.
-fn open_at(path: &Path, terminal: Option<&Path>) -> io::Result<(UnixListener, (u64, u64))> {
-    match fs::symlink_metadata(path) {
+/// Opens the socket at a path.
+fn open_at(path: &Path, terminal: Option<&Path>) -> io::Result<(UnixListener, Place)> {
+    // A client has to connect by this path.
+    UnixAddr::new(path)?;
+    let name = path.file_name().ok_or(io::ErrorKind::IsADirectory)?.to_owned();
+    let folder = OwnFolder::open(path.parent().unwrap_or(Path::new("")))?;
+    let placed = folder.at(&name);
+    match fs::symlink_metadata(&placed) {
         Ok(found) if !found.file_type().is_socket() => {
             return Err(io::Error::other("there is something else: remove it, or choose another --socket"));
         }
-        Ok(_) => match connect(path) {
+        Ok(_) => match connect(&placed) {
             Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {}
             // A socket whose queue is full is alive too.
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return Err(error),
@@ -128,24 +161,30 @@ fn open_at(path: &Path, terminal: Option<&Path>) -> io::Result<(UnixListener, (u
         Err(_) => {}
     }
     // A rename puts the socket in place with its permissions, and replaces a stale one, in one step.
-    let mut fresh = path.as_os_str().to_owned();
+    let mut fresh = name.clone();
     fresh.push(format!(".{}", std::process::id()));
-    let fresh = PathBuf::from(fresh);
+    let fresh = folder.at(fresh);
     let _ = fs::remove_file(&fresh);
-    let listener = UnixListener::bind(&fresh)?;
-    let placed = (|| {
-        listener.set_nonblocking(true)?;
+    let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
+    let listener = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
+    bind(listener.as_raw_fd(), &UnixAddr::new(&fresh)?)?;
+    let put = (|| {
+        let flags = (OFlag::O_PATH | OFlag::O_NOFOLLOW).bits();
+        let file = OpenOptions::new().read(true).custom_flags(flags).open(&fresh)?;
+        let (ours, same) = (file.metadata()?, below(&file));
         if let Some(terminal) = terminal {
             let gid = fs::metadata(terminal)?.gid();
             // Only root and the group's members may do this. Without it only our own user and root may ask.
-            let _ = chown(&fresh, None, Some(gid));
+            let _ = chown(&same, None, Some(gid));
         }
-        fs::set_permissions(&fresh, fs::Permissions::from_mode(0o660))?;
-        let ours = fs::symlink_metadata(&fresh)?;
-        fs::rename(&fresh, path)?;
+        fs::set_permissions(&same, fs::Permissions::from_mode(0o660))?;
+        // Nobody connects before the permissions are set.
+        listen(&listener, Backlog::MAXCONN)?;
+        fs::rename(&fresh, &placed)?;
         Ok((ours.dev(), ours.ino()))
     })();
-    placed.map(|id| (listener, id)).inspect_err(|_: &io::Error| drop(fs::remove_file(&fresh)))
+    let id = put.inspect_err(|_: &io::Error| drop(fs::remove_file(&fresh)))?;
+    Ok((UnixListener::from(listener), Place { path: path.to_owned(), folder, name, id }))
 }
 
 /// Connects to the socket of an instance. It does not wait for an instance that hangs.
@@ -156,44 +195,80 @@ pub(crate) fn connect(path: &Path) -> io::Result<UnixStream> {
     Ok(UnixStream::from(socket))
 }
 
-/// Starts the thread. It ends when the returned value is dropped.
-fn serve_on(listener: UnixListener, mut reporter: Reporter) -> io::Result<PipeWriter> {
+/// Starts a thread that gives each client an answer. It ends when the returned value is dropped. `answer` is called for
+/// all clients that wait.
+pub(in crate::runtime) fn serve_on(
+    listener: UnixListener,
+    thread: &str,
+    manners: Manners,
+    answer: impl FnMut() -> Option<Vec<u8>> + Send + 'static,
+) -> io::Result<PipeWriter> {
     let (end, alive) = io::pipe()?;
-    thread::Builder::new().name("status".into()).spawn(move || serve(&listener, &end, &mut reporter))?;
+    thread::Builder::new().name(thread.into()).spawn(move || serve(&listener, &end, manners, answer))?;
     Ok(alive)
 }
 
-fn serve(listener: &UnixListener, end: &PipeReader, reporter: &mut Reporter) {
-    loop {
-        let mut fds = [PollFd::new(listener.as_fd(), PollFlags::POLLIN), PollFd::new(end.as_fd(), PollFlags::empty())];
-        let _ = poll(&mut fds, PollTimeout::NONE);
-        if fds[1].any().unwrap_or(true) {
-            return;
-        }
-        let clients: Vec<UnixStream> =
-            std::iter::from_fn(|| Some(listener.accept().ok()?.0)).take(CLIENTS_MAX).collect();
-        if !clients.is_empty() {
-            match serde_json::to_string(&reporter.status()) {
-                Ok(document) => {
-                    let document = plain_json(&document);
-                    clients.into_iter().for_each(|client| give(client, document.as_bytes()));
-                }
-                Err(error) => {
-                    warn!("pinion status is not answered: {error}: this is a bug in Pinion, please report it")
+/// An answer, and the clients that still read it.
+struct Answer {
+    bytes: Vec<u8>,
+    /// Each with the number of bytes that it has.
+    clients: Vec<(UnixStream, usize)>,
+    until: Duration,
+}
+
+impl Answer {
+    /// Sends as much as the clients take now. Those that have it all, or have gone, are let go.
+    fn send(&mut self) {
+        self.clients.retain_mut(|(client, sent)| {
+            loop {
+                match client.write(&self.bytes[*sent..]) {
+                    Ok(written @ 1..) => *sent += written,
+                    Err(error) if error.kind() == io::ErrorKind::WouldBlock => return true,
+                    _ => return false,
                 }
             }
-        }
-        thread::sleep(PAUSE);
+        });
     }
 }
 
-/// Sends the document. A client that does not read gets as much of it as there is room for.
-fn give(mut client: UnixStream, mut document: &[u8]) {
-    if client.set_nonblocking(true).is_err() {
-        return;
-    }
-    while let Ok(written @ 1..) = client.write(document) {
-        document = &document[written..];
+/// A client that does not read keeps neither this thread nor another client. It gets as much as there is room for.
+fn serve(listener: &UnixListener, end: &PipeReader, manners: Manners, mut answer: impl FnMut() -> Option<Vec<u8>>) {
+    // The oldest one is the first.
+    let mut answers: VecDeque<Answer> = VecDeque::new();
+    let mut next = Duration::ZERO;
+    loop {
+        let now = monotonic();
+        let pause = next.checked_sub(now).filter(|pause| !pause.is_zero());
+        let asked = if pause.is_some() { PollFlags::empty() } else { PollFlags::POLLIN };
+        let mut fds = vec![PollFd::new(end.as_fd(), PollFlags::empty()), PollFd::new(listener.as_fd(), asked)];
+        let reading = answers.iter().flat_map(|answer| &answer.clients);
+        fds.extend(reading.map(|(client, _)| PollFd::new(client.as_fd(), PollFlags::POLLOUT)));
+        let left = answers.front().map(|oldest| oldest.until.saturating_sub(now));
+        let _ = poll(&mut fds, sooner(pause, left).map_or(PollTimeout::NONE, poll_timeout));
+        if fds[0].any().unwrap_or(true) {
+            return;
+        }
+        let is_asked = fds[1].any().unwrap_or(false);
+        answers.iter_mut().for_each(Answer::send);
+        let now = monotonic();
+        answers.retain(|answer| !answer.clients.is_empty() && answer.until > now);
+        if !is_asked {
+            continue;
+        }
+        let clients = std::iter::from_fn(|| Some(listener.accept().ok()?.0)).take(CLIENTS_MAX);
+        let clients = clients.filter(|client| client.set_nonblocking(true).is_ok());
+        let clients: Vec<_> = clients.map(|client| (client, 0)).collect();
+        if !clients.is_empty()
+            && let Some(bytes) = answer()
+        {
+            let mut given = Answer { bytes, clients, until: monotonic() + manners.limit };
+            given.send();
+            answers.extend((!given.clients.is_empty()).then_some(given));
+        }
+        if answers.len() > ANSWERS_MAX {
+            answers.pop_front();
+        }
+        next = monotonic() + manners.pause;
     }
 }
 
@@ -207,7 +282,6 @@ mod tests {
     fn facts() -> Facts {
         Facts {
             link: "/tmp/klipper_host_mcu".into(),
-            terminal: "/dev/pts/3".into(),
             board: "a board".into(),
             pins: Vec::new(),
             view: None,
@@ -265,5 +339,57 @@ mod tests {
         drop(first);
         assert!(path.exists());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "nothing else is left");
+    }
+
+    /// A socket whose clients get `bytes`.
+    fn served(limit: Duration, bytes: usize) -> (tempfile::TempDir, PipeWriter, impl Fn() -> UnixStream) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("s");
+        let listener = UnixListener::bind(&path).unwrap();
+        listener.set_nonblocking(true).unwrap();
+        let manners = Manners { pause: Duration::from_millis(1), limit };
+        let thread = serve_on(listener, "test", manners, move || Some(vec![7; bytes])).unwrap();
+        // A client that is in the kernel's queue is not being served yet: its first byte tells.
+        let client = move || {
+            let client = UnixStream::connect(&path).unwrap();
+            let mut fds = [PollFd::new(client.as_fd(), PollFlags::POLLIN)];
+            poll(&mut fds, PollTimeout::NONE).unwrap();
+            client
+        };
+        (folder, thread, client)
+    }
+
+    fn read(mut client: UnixStream) -> usize {
+        let mut bytes = Vec::new();
+        client.read_to_end(&mut bytes).unwrap();
+        bytes.len()
+    }
+
+    /// More than the kernel keeps for a client.
+    const LARGE: usize = 8 << 20;
+
+    #[test]
+    fn clients_that_do_not_read_keep_nobody_and_the_oldest_is_let_go() {
+        let (_folder, thread, client) = served(Duration::from_secs(3600), LARGE);
+        let idle: Vec<UnixStream> = (0..ANSWERS_MAX + 1).map(|_| client()).collect();
+        assert_eq!(read(client()), LARGE);
+        let got: Vec<bool> = idle.into_iter().map(|client| read(client) == LARGE).collect();
+        assert_eq!(got, [false, false, true, true, true]);
+        drop(thread);
+    }
+
+    #[test]
+    fn a_slow_client_is_let_go_after_its_time() {
+        let (_folder, thread, client) = served(Duration::from_millis(50), LARGE);
+        let (mut slow, mut got) = (client(), 0);
+        loop {
+            match slow.read(&mut [0; 100]).unwrap() {
+                0 => break,
+                read => got += read,
+            }
+            thread::sleep(Duration::from_millis(1));
+        }
+        assert!(got < LARGE, "it got all");
+        drop(thread);
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use super::process;
+use super::{describe, process};
 
 /// The package lists are renewed when they are older than this.
 const LISTS_AGE_MAX: Duration = Duration::from_secs(24 * 3600);
@@ -129,10 +129,6 @@ pub fn option(name: &str, path: &Path) -> OsString {
     let mut option = OsString::from(format!("{name}="));
     option.push(path);
     option
-}
-
-fn describe(action: &str, path: &Path, error: &std::io::Error) -> String {
-    format!("cannot {action} {}: {error}", path.display())
 }
 
 #[cfg(test)]

@@ -2,7 +2,9 @@
 //! Whether this computer lets a test run, and what the test then sees of it.
 
 use std::env;
+use std::fs;
 use std::io::{self, Write};
+use std::os::unix::fs::MetadataExt;
 use std::process::{Command, Stdio};
 use std::thread;
 
@@ -22,6 +24,15 @@ pub fn may_mount() -> bool {
         not_run("it mounts file systems, which takes root, and a container that permits it");
     }
     allowed
+}
+
+/// Whether the test may give files to another user. If not, this says that the test is not run.
+pub fn is_root() -> bool {
+    let is_root = fs::metadata("/proc/self").is_ok_and(|about| about.uid() == 0);
+    if !is_root {
+        not_run("it gives files to another user, which takes root");
+    }
+    is_root
 }
 
 /// Runs the test's body in a PID namespace, so that it sees no process of the computer but its own. This takes a second

@@ -15,7 +15,7 @@ use std::str::FromStr;
 use super::apt::Apt;
 use super::cache::Cache;
 use super::initramfs::Archive;
-use super::{process, tools};
+use super::{describe, process, tools};
 
 /// The kernels come from this release of Debian on every computer. The mocks are written for its kernel, and figures of two
 /// computers can be compared.
@@ -562,8 +562,4 @@ fn remove(path: &Path) -> Result<(), String> {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(describe("remove", path, &error)),
         _ => Ok(()),
     }
-}
-
-fn describe(action: &str, path: &Path, error: &io::Error) -> String {
-    format!("cannot {action} {}: {error}", path.display())
 }

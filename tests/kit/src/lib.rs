@@ -10,6 +10,9 @@
 
 #![forbid(unsafe_code)]
 
+use std::io;
+use std::path::Path;
+
 pub mod apt;
 pub mod arguments;
 pub mod browser;
@@ -20,3 +23,8 @@ pub mod kernel;
 pub mod markdown;
 pub mod process;
 pub mod tools;
+
+/// A file's error, with what failed on which path.
+fn describe(action: &str, path: &Path, error: &io::Error) -> String {
+    format!("cannot {action} {}: {error}", path.display())
+}

@@ -245,6 +245,9 @@ mod request {
     nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
     nix::ioctl_none_bad!(tiocexcl, libc::TIOCEXCL);
+    nix::ioctl_none_bad!(tiocnxcl, libc::TIOCNXCL);
+    nix::ioctl_read_bad!(tiocgetd, libc::TIOCGETD, i32);
+    nix::ioctl_write_ptr_bad!(tiocsetd, libc::TIOCSETD, i32);
     nix::ioctl_read_bad!(tcgets2, libc::TCGETS2, libc::termios2);
     nix::ioctl_write_ptr_bad!(tcsets2, libc::TCSETS2, libc::termios2);
     nix::ioctl_read_bad!(tiocgicount, libc::TIOCGICOUNT, super::LineCounts);
@@ -256,6 +259,26 @@ mod request {
 pub fn make_exclusive(terminal: &impl AsFd) -> io::Result<()> {
     // SAFETY: the request takes nothing.
     unsafe { request::tiocexcl(terminal.as_fd().as_raw_fd()) }?;
+    Ok(())
+}
+
+/// Takes back [`make_exclusive`], whoever has called it.
+pub fn make_shared(terminal: &impl AsFd) -> io::Result<()> {
+    // SAFETY: the request takes nothing.
+    unsafe { request::tiocnxcl(terminal.as_fd().as_raw_fd()) }?;
+    Ok(())
+}
+
+/// Gives a terminal its usual line discipline (N_TTY of linux/tty.h).
+pub fn use_usual_discipline(terminal: &impl AsFd) -> io::Result<()> {
+    const USUAL: i32 = 0;
+    let mut discipline = USUAL;
+    // SAFETY: the request writes an int, which lives through the call.
+    unsafe { request::tiocgetd(terminal.as_fd().as_raw_fd(), &mut discipline) }?;
+    if discipline != USUAL {
+        // SAFETY: the request reads an int, which lives through the call.
+        unsafe { request::tiocsetd(terminal.as_fd().as_raw_fd(), &USUAL) }?;
+    }
     Ok(())
 }
 
@@ -466,6 +489,18 @@ mod tests {
         })
         .join()
         .unwrap();
+    }
+
+    #[test]
+    fn a_terminal_that_another_program_made_useless_is_usable_again() {
+        let pty = nix::pty::openpty(None, None).unwrap();
+        // N_NULL, for which no rights are needed. It reads and writes nothing.
+        // SAFETY: the request reads an int, which lives through the call.
+        unsafe { request::tiocsetd(pty.slave.as_raw_fd(), &27) }.unwrap();
+        assert!(nix::unistd::write(&pty.slave, b"x").is_err());
+        use_usual_discipline(&pty.slave).unwrap();
+        assert_eq!(nix::unistd::write(&pty.slave, b"x"), Ok(1));
+        use_usual_discipline(&pty.slave).unwrap();
     }
 
     #[test]

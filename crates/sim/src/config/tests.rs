@@ -208,14 +208,16 @@ fn corexy_needs_three_homed_axes_with_equal_belts() {
 }
 
 #[test]
-fn a_missing_file_is_named() {
-    let error = SimConfig::load(Path::new("/nonexistent/printer.toml"));
-    let error = error.map_or_else(|error| error.to_string(), |_| String::new());
-    assert!(error.starts_with("/nonexistent/printer.toml: "), "{error}");
-}
-
-#[test]
 fn an_empty_description_is_a_board_without_pins() {
     let config = SimConfig::parse("", "empty.toml");
     assert!(config.is_ok_and(|config| config.axes.is_empty()));
+}
+
+#[test]
+fn a_description_of_too_many_parts_is_refused_at_once() {
+    let part = |n| format!("[[spi_bus]]\nname = \"b{n}\"\n[[part]]\nkind = \"loopback\"\nbus = \"b{n}\"\n");
+    let parts = |count: u32| (0..count).map(part).collect::<String>();
+    assert!(SimConfig::parse(&parts(100), "my.toml").is_ok());
+    let error = SimConfig::parse(&parts(1001), "my.toml").map(drop).unwrap_err();
+    assert_eq!(error.to_string(), "my.toml: there are 1001 parts: 1000 at most");
 }

@@ -238,6 +238,11 @@ impl Recorder {
         self.off_mm[0]
     }
 
+    /// The filament of a step, of the extruder with the longest steps.
+    pub fn filament_step_mm(&self) -> f64 {
+        self.off_mm[3] / STEPS_OFF
+    }
+
     /// How often steps were overwritten before they were read.
     pub fn gaps(&self) -> u64 {
         self.gaps

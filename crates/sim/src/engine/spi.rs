@@ -7,7 +7,6 @@
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Write as _;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -86,23 +85,19 @@ struct Socket {
 
 /// A record of transfers, one line each.
 struct Trace {
-    path: PathBuf,
-    file: File,
+    /// The name of the bus.
+    bus: String,
+    /// All buses write into one file, in the order of their transfers.
+    file: Option<Arc<File>>,
     /// Outputs with levels that are recorded at each byte.
     pins: Vec<(String, Arc<Lamp>, bool)>,
 }
 
 impl Trace {
-    fn record(
-        &mut self,
-        chips: &[&mut Socket],
-        sent: &[u8],
-        received: &[u8],
-        levels: &[String],
-    ) -> Result<(), BusError> {
-        let mut line = String::from("chips=");
+    fn record(&self, chips: &[&mut Socket], sent: &[u8], received: &[u8], levels: &[String]) -> Result<(), BusError> {
+        let Some(mut file) = self.file.as_deref() else { return Ok(()) };
         let names: Vec<&str> = chips.iter().map(|socket| socket.name.as_str()).collect();
-        line += &names.join("+");
+        let mut line = format!("bus={} chips={}", self.bus, names.join("+"));
         for (key, bytes) in [("sent", sent), ("received", received)] {
             line += &format!(" {key}=");
             for byte in bytes {
@@ -115,9 +110,9 @@ impl Trace {
         }
         line.push('\n');
         // In one write, so that a reader never sees half a line.
-        self.file.write_all(line.as_bytes()).map_err(|error| {
-            let trouble = Trouble::new(format!("{} cannot be written: {error}", self.path.display()));
-            BusError::new(BusStatus::Nack, trouble.remedy("choose another trace_file"))
+        file.write_all(line.as_bytes()).map_err(|error| {
+            let trouble = Trouble::new(format!("the record of the SPI transfers cannot be written: {error}"));
+            BusError::new(BusStatus::Nack, trouble.remedy("free space, or choose another file"))
         })
     }
 }
@@ -125,7 +120,7 @@ impl Trace {
 struct Wires {
     sockets: Vec<Socket>,
     listeners: Vec<Box<dyn MosiListener>>,
-    trace: Option<Trace>,
+    trace: Trace,
 }
 
 pub(crate) struct SpiBus {
@@ -138,21 +133,17 @@ pub(crate) struct SpiBus {
 
 impl SpiBus {
     /// The bus of a description, without chips. `lamp` finds the output of a pin.
-    pub(crate) fn new(
-        config: &SpiBusConfig,
-        lamp: impl Fn(&str) -> Option<(Arc<Lamp>, bool)>,
-    ) -> Result<SpiBus, Trouble> {
-        let trace = match &config.trace_file {
-            None => None,
-            Some(path) => {
-                let pins = config.trace_pins.iter();
-                let pins = pins.filter_map(|name| lamp(name).map(|(lamp, inverted)| (name.clone(), lamp, inverted)));
-                let file = File::create(path).map_err(|error| config.no_trace_file(&error))?;
-                Some(Trace { path: path.clone(), file, pins: pins.collect() })
-            }
-        };
+    pub(crate) fn new(config: &SpiBusConfig, lamp: impl Fn(&str) -> Option<(Arc<Lamp>, bool)>) -> SpiBus {
+        let pins = config.trace_pins.iter();
+        let pins = pins.filter_map(|name| lamp(name).map(|(lamp, inverted)| (name.clone(), lamp, inverted)));
+        let trace = Trace { bus: config.name.clone(), file: None, pins: pins.collect() };
         let wires = Mutex::new(Wires { sockets: Vec::new(), listeners: Vec::new(), trace });
-        Ok(SpiBus { name: config.name.clone(), delay: Duration::from_micros(config.delay_us), wires })
+        SpiBus { name: config.name.clone(), delay: Duration::from_micros(config.delay_us), wires }
+    }
+
+    /// Writes a line for each transfer into this file from now on.
+    pub(crate) fn record_to(&self, file: Arc<File>) {
+        self.wires.lock().unwrap_or_else(PoisonError::into_inner).trace.file = Some(file);
     }
 
     /// Puts a chip on the bus.
@@ -174,12 +165,12 @@ impl SpiBus {
         let mut chips: Vec<&mut Socket> =
             sockets.iter_mut().filter(|socket| is_selected(socket) && socket.chip.knows_mode(mode)).collect();
         let sent = bytes.to_vec();
-        let mut levels = vec![String::new(); trace.as_ref().map_or(0, |trace| trace.pins.len())];
+        let mut levels = vec![String::new(); trace.pins.len()];
         let pace = Pace { start: Instant::now(), delay: self.delay, bytes: bytes.len() };
         chips.iter_mut().for_each(|socket| socket.chip.select(rate_hz));
         for (n, byte) in bytes.iter_mut().enumerate() {
             pace.wait(n + 1);
-            for ((_, lamp, inverted), levels) in trace.iter().flat_map(|trace| &trace.pins).zip(&mut levels) {
+            for ((_, lamp, inverted), levels) in trace.pins.iter().zip(&mut levels) {
                 levels.push(if lamp.is_on() != *inverted { '1' } else { '0' });
             }
             // An undriven wire is pulled up. A chip that drives it low wins.
@@ -188,7 +179,7 @@ impl SpiBus {
         pace.wait(pace.bytes);
         chips.iter_mut().for_each(|socket| socket.chip.deselect());
         listeners.iter_mut().for_each(|listener| listener.hear(rate_hz, &sent));
-        trace.as_mut().map_or(Ok(()), |trace| trace.record(&chips, &sent, bytes, &levels))
+        trace.record(&chips, &sent, bytes, &levels)
     }
 }
 

@@ -4,11 +4,17 @@
 #![forbid(unsafe_code)]
 
 use std::f64::consts::TAU;
-use std::fs;
-use std::path::Path;
+use std::io::{BufRead, Read};
 
+use super::{PIECES_MAX, count_pieces};
 use crate::description::check::Trouble;
 
+/// Longest line of a file, in bytes.
+const LINE_MAX: u64 = 1 << 20;
+/// Highest number of a place. A larger one describes no printer, and could overflow a distance.
+const NUMBER_MAX: f64 = 1e9;
+/// Longest part of a wrong number that is shown.
+const SHOWN_MAX: usize = 20;
 /// Greatest distance of a chord from its arc.
 const CHORD_MM: f64 = 0.002;
 /// Least rise of the nozzle from one layer to the next.
@@ -35,24 +41,28 @@ pub struct AskedPath {
 }
 
 impl AskedPath {
-    /// Reads a file.
+    /// Reads a file line by line; `origin` is its name in an error.
     ///
     /// # Errors
     ///
-    /// The file cannot be read, a number in it is none, or it never asks for a place.
-    pub fn load(path: &Path) -> Result<AskedPath, Trouble> {
-        let file = path.display().to_string();
-        let bytes = fs::read(path)
-            .map_err(|error| Trouble::new(error.to_string()).of(&file).remedy("name a readable G-code file"))?;
-        AskedPath::parse(&String::from_utf8_lossy(&bytes), &file)
-    }
-
-    /// Reads a text; `origin` is its name in an error.
-    pub(crate) fn parse(text: &str, origin: &str) -> Result<AskedPath, Trouble> {
+    /// The file cannot be read, a number in it is none, it never asks for a place, or its path is too long.
+    pub fn read(mut file: impl BufRead, origin: &str) -> Result<AskedPath, Trouble> {
         let mut reader = Reader::default();
-        for (number, line) in (1..).zip(text.lines()) {
+        let mut line = Vec::new();
+        for number in 1.. {
+            line.clear();
+            let read = file.by_ref().take(LINE_MAX).read_until(b'\n', &mut line);
+            if read.map_err(|error| Trouble::new(error.to_string()).of(origin))? == 0 {
+                break;
+            }
             reader.line = number;
-            reader.read(line).map_err(|trouble| trouble.of(format_args!("{origin}:{number}")))?;
+            let read = if line.len() as u64 == LINE_MAX && !line.ends_with(b"\n") {
+                let trouble = Trouble::new(format!("the line is longer than {LINE_MAX} bytes"));
+                Err(trouble.remedy("name a G-code file"))
+            } else {
+                reader.read(&String::from_utf8_lossy(&line))
+            };
+            read.map_err(|trouble| trouble.of(format_args!("{origin}:{number}")))?;
         }
         if reader.path.points.len() < 2 {
             let trouble = Trouble::new("it never moves the nozzle between two known places").of(origin);
@@ -87,9 +97,14 @@ impl<'a> Words<'a> {
     fn get(&self, name: &str) -> Result<Option<f64>, Trouble> {
         let Some((_, value)) = self.0.iter().rfind(|(its, _)| *its == name) else { return Ok(None) };
         let value = value.trim();
-        match value.parse::<f64>().ok().filter(|number| number.is_finite()) {
-            Some(number) => Ok(Some(number)),
-            None => Err(Trouble::new(format!("`{name}{value}` has no number")).remedy("correct it")),
+        let wrong = |what: &str| {
+            let shown: String = value.chars().take(SHOWN_MAX).collect();
+            Err(Trouble::new(format!("`{name}{shown}` {what}")).remedy("correct it"))
+        };
+        match value.parse::<f64>() {
+            Ok(number) if number.abs() <= NUMBER_MAX => Ok(Some(number)),
+            Ok(_) => wrong("is out of range"),
+            Err(_) => wrong("has no number"),
         }
     }
 }
@@ -108,6 +123,8 @@ struct Reader {
     layer: u32,
     layer_z: f64,
     pushed_mm: f64,
+    /// How many pieces the path has for the comparison.
+    pieces: f64,
 }
 
 impl Default for Reader {
@@ -123,6 +140,7 @@ impl Default for Reader {
             layer: 0,
             layer_z: f64::NEG_INFINITY,
             pushed_mm: 0.0,
+            pieces: 0.0,
         }
     }
 }
@@ -146,7 +164,7 @@ impl Reader {
         match (*letter, number) {
             ("G", "0" | "00" | "1" | "01") => {
                 let to = self.target(&words)?;
-                self.go(to);
+                self.go(to)?;
             }
             ("G", "2" | "02") => self.arc(&words, true)?,
             ("G", "3" | "03") => self.arc(&words, false)?,
@@ -187,37 +205,40 @@ impl Reader {
         Ok(to)
     }
 
-    fn go(&mut self, to: [Option<f64>; 4]) {
+    fn go(&mut self, to: [Option<f64>; 4]) -> Result<(), Trouble> {
         let filament_mm = to[3].unwrap_or(0.0);
         let is_laid = filament_mm > self.pushed_mm && to[..3] != self.at[..3];
         self.path.filament_mm += (filament_mm - self.pushed_mm).max(0.0);
         self.pushed_mm = self.pushed_mm.max(filament_mm);
         self.at = to;
-        let [Some(x), Some(y), Some(z), _] = to else { return };
+        let [Some(x), Some(y), Some(z), _] = to else { return Ok(()) };
         if is_laid && (z - self.layer_z).abs() > LAYER_MM {
             self.layer += 1;
             self.layer_z = z;
         }
         let nozzle_mm = [x, y, z];
-        let is_new = self.path.points.last().is_none_or(|last| last.nozzle_mm != nozzle_mm);
-        if is_new || self.is_start {
+        let last = self.path.points.last();
+        if self.is_start || last.is_none_or(|last| last.nozzle_mm != nozzle_mm) {
+            self.pieces += last.filter(|_| !self.is_start).map_or(1.0, |last| count_pieces(last.nozzle_mm, nozzle_mm));
+            if self.pieces > PIECES_MAX {
+                let trouble = Trouble::new("the path up to here is too long to be compared");
+                return Err(trouble.remedy("correct its places and arcs, or name a shorter file"));
+            }
             let (layer, line) = (self.layer.max(1), self.line);
             self.path.points.push(AskedPoint { nozzle_mm, layer, line, is_start: self.is_start });
             self.is_start = false;
         }
+        Ok(())
     }
 
     /// An arc around a center in the plane of x and y, as klippy's `[gcode_arcs]` takes it: I and J are relative.
     fn arc(&mut self, words: &Words<'_>, clockwise: bool) -> Result<(), Trouble> {
         let to = self.target(words)?;
         let offset = [words.get("I")?.unwrap_or(0.0), words.get("J")?.unwrap_or(0.0)];
-        let (from, [Some(x), Some(y), ..]) = (self.at, to) else {
-            self.go(to);
-            return Ok(());
-        };
-        let [Some(x0), Some(y0), ..] = from else {
-            self.go(to);
-            return Ok(());
+        let from = self.at;
+        // Without a known place at both ends, no place between them is known either.
+        let ([Some(x0), Some(y0), Some(_), _], [Some(x), Some(y), Some(_), _]) = (from, to) else {
+            return self.go(to);
         };
         let radius = offset[0].hypot(offset[1]);
         if radius == 0.0 {
@@ -238,10 +259,9 @@ impl Reader {
             let between = |axis: usize| Some(from[axis]? + (to[axis]? - from[axis]?) * share);
             let (sine, cosine) = angle.sin_cos();
             let [x, y] = [center[0] + radius * cosine, center[1] + radius * sine];
-            self.go([Some(x), Some(y), between(2), between(3)]);
+            self.go([Some(x), Some(y), between(2), between(3)])?;
         }
-        self.go(to);
-        Ok(())
+        self.go(to)
     }
 }
 
@@ -249,8 +269,12 @@ impl Reader {
 mod tests {
     use super::*;
 
+    fn parse(text: &str) -> Result<AskedPath, Trouble> {
+        AskedPath::read(text.as_bytes(), "a.gcode")
+    }
+
     fn places(text: &str) -> Vec<[f64; 3]> {
-        AskedPath::parse(text, "a.gcode").unwrap().points.iter().map(|point| point.nozzle_mm).collect()
+        parse(text).unwrap().points.iter().map(|point| point.nozzle_mm).collect()
     }
 
     #[test]
@@ -259,7 +283,7 @@ mod tests {
                     G92 X0\ng1 x5 y5\nG92 E0\nM82\nG1 E2\n";
         let expected = [[10.0, 20.0, 0.2], [15.0, 20.0, 0.2], [15.0, 15.0, 1.2], [20.0, 5.0, 1.2]];
         assert_eq!(places(text), expected);
-        assert_eq!(AskedPath::parse(text, "a").unwrap().filament_mm, 3.0);
+        assert_eq!(parse(text).unwrap().filament_mm, 3.0);
     }
 
     #[test]
@@ -267,7 +291,7 @@ mod tests {
         // The expected numbers are those that klippy's regular expression `args_r` finds.
         let text = "G28XY\nM83\nG1X10Y20Z0.2F3000\nN7G1X 15E1*71\nG1 Y 25 X20 X16\nG91\nG0Y-5Z+.5\nG90\nG1X1E5Y2\nG1XY9X3\n\
                     M117 50% 3/4\nG92X0\ng01x.5\n";
-        let path = AskedPath::parse(text, "a").unwrap();
+        let path = parse(text).unwrap();
         let found: Vec<_> = path.points.iter().map(|point| (point.nozzle_mm, point.is_start)).collect();
         let expected = [
             ([10.0, 20.0, 0.2], true),
@@ -282,7 +306,7 @@ mod tests {
         assert_eq!(path.filament_mm, 6.0);
         // A macro with a number, a macro of one letter, and what klippy refuses.
         for line in ["PARK2 X5", "Z", "G 1 X5", "1G1 X5", "_G1 X5"] {
-            let path = AskedPath::parse(&format!("G1X1Y1Z1\n{line}\nG1X2"), "a").unwrap();
+            let path = parse(&format!("G1X1Y1Z1\n{line}\nG1X2")).unwrap();
             let last = path.points.last().map(|last| (last.nozzle_mm, last.is_start));
             assert_eq!((path.points.len(), last), (2, Some(([2.0, 1.0, 1.0], true))), "{line}");
         }
@@ -291,8 +315,7 @@ mod tests {
     #[test]
     fn a_place_is_known_after_homing_when_the_file_names_it() {
         // X and Y alone leave the height unknown.
-        let path =
-            AskedPath::parse("G28\nG1 X1 Y1\nG1 X2\nG1 Z3\nG1 X4\nG28 X\nG1 Y9\nG1 X5\nM117 X\nPARK\nG1 X6", "a");
+        let path = parse("G28\nG1 X1 Y1\nG1 X2\nG1 Z3\nG1 X4\nG28 X\nG1 Y9\nG1 X5\nM117 X\nPARK\nG1 X6");
         let points = path.unwrap().points;
         let found: Vec<_> = points.iter().map(|point| (point.nozzle_mm, point.is_start, point.line)).collect();
         let expected = [
@@ -308,7 +331,7 @@ mod tests {
     fn layers_begin_where_filament_is_laid_at_a_new_height() {
         let text =
             "M83\nG1 X0 Y0 Z5\nG1 Z.2\nG1 X9 E1\nG1 E-1\nG1 Z.6\nG1 X0\nG1 Z.2\nG1 E1\nG1 X3 E1\nG1 Z.4\nG1 X9 E1\n";
-        let path = AskedPath::parse(text, "a").unwrap();
+        let path = parse(text).unwrap();
         let layers: Vec<u32> = path.points.iter().map(|point| point.layer).collect();
         assert_eq!(layers, [1, 1, 1, 1, 1, 1, 1, 1, 2]);
         assert_eq!(path.filament_mm, 3.0);
@@ -339,9 +362,25 @@ mod tests {
             ("G1 X1 Y1 Z1\nG2 X3 Y3 R2", "a.gcode:2: an arc has no center: give I or J"),
             ("; nothing", "a.gcode: it never moves the nozzle between two known places: name"),
             ("G1 X\u{e9}", "has no number"),
+            ("G1 X1\nG91\nG1 X-1000000001", "a.gcode:3: `X-1000000001` is out of range: correct it"),
+            (&format!("G1 X{}", "9".repeat(400)), "a.gcode:1: `X99999999999999999999` is out of range"),
+            (&format!("G1 X1\n{}", "x".repeat(1 << 20)), "a.gcode:2: the line is longer than 1048576 bytes: name"),
         ] {
-            let Err(error) = AskedPath::parse(text, "a.gcode") else { panic!("accepted {text}") };
+            let Err(error) = parse(text) else { panic!("accepted {text}") };
             assert!(error.to_string().contains(part), "{error}");
         }
+    }
+    #[test]
+    fn a_path_is_not_longer_than_can_be_compared() {
+        let start = "G1 X1 Y1 Z1\n";
+        let arcs = format!("{start}{}", "G2 I999999999\n".repeat(2000));
+        let lines = format!("{start}{}", "G1 X1000000\nG1 X1\n".repeat(1000));
+        for (text, line) in [(&*arcs, 2), (&*lines, 18), ("G1 X1 Y1 Z1\nG1 X1000000000", 2)] {
+            let Err(error) = parse(text) else { panic!("accepted {}", &text[..40]) };
+            let expected = format!("a.gcode:{line}: the path up to here is too long to be compared: correct its");
+            assert!(error.to_string().starts_with(&expected), "{error}");
+        }
+        // Where the height is not known, an arc has no places.
+        assert_eq!(places(&format!("G1 X1 Y1\n{}G1 X2 Y2 Z2\nG1 X3", "G2 I999999999\n".repeat(2000))).len(), 2);
     }
 }

@@ -11,7 +11,8 @@
 use std::collections::BTreeMap;
 
 use super::asked::{AskedPath, AskedPoint};
-use super::{distance, lines, nearest};
+use super::{PIECE_MM, PIECES_MAX, count_pieces, distance, lines, nearest};
+use crate::description::check::Trouble;
 use crate::engine::recorder::PathPoint;
 
 /// A line of the motors that the file does not ask for costs as if it were off by this: before the file, after it, and
@@ -25,12 +26,13 @@ const FAR_MM: f64 = 20.0;
 const HEIGHT: f64 = 0.02;
 /// Places that cost this much more than the best one are given up.
 const BEAM: f64 = 500.0;
-/// Longest piece of a line that is laid as a whole. The cost of a way then grows step by step.
-const PIECE_MM: f64 = 2.0;
 /// Each point stands for this length at least. Else a point between short lines could be far off at no cost.
 const LEAST_MM: f64 = 0.5;
 /// The file has begun when the motors have followed it this far, at most `BEFORE_MM` off.
 const BEGUN_MM: f64 = 50.0;
+/// Highest number of pairs of a piece of the motors and a state: 256 MiB of memory, and a number of 32 bits. Ten hours
+/// of printing have about 50 million, unless lines are laid over each other again and again.
+const PAIRS_MAX: usize = 1 << 31;
 
 /// Distances between the two paths.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -106,7 +108,7 @@ struct States {
 
 /// The ends of the pieces of a line, without its start.
 fn pieces(from: [f64; 3], to: [f64; 3]) -> impl Iterator<Item = [f64; 3]> {
-    let count = (distance(from, to) / PIECE_MM).ceil().max(1.0);
+    let count = count_pieces(from, to);
     let at = move |n: u32| [0, 1, 2].map(|i: usize| from[i] + (to[i] - from[i]) * (f64::from(n) / count));
     (1..count as u32).map(at).chain([to])
 }
@@ -195,11 +197,23 @@ struct Cost {
     begun: (f64, f64),
 }
 
-/// Compares the motors' path with the path that a file asks for. `None` if the motors never followed the file.
-pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
+/// Compares the motors' path with the path that a file asks for.
+///
+/// # Errors
+///
+/// The motors never followed the file, or one of the paths is too long.
+pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Result<Comparison, Trouble> {
+    let too_long = || Trouble::new("the motors' path is too long to be compared").remedy("print a shorter file");
+    let never = || {
+        let trouble = Trouble::new("the motors never went along the path of this file");
+        trouble.remedy("print it, and check position_endstop and the offsets")
+    };
     let states = States::new(asked);
     let mut moves: Vec<[[f64; 3]; 2]> = Vec::new();
     for line in lines(points).filter(|line| line.mm() > 0.0) {
+        if moves.len() as f64 + count_pieces(line.from.nozzle_mm, line.to.nozzle_mm) > PIECES_MAX {
+            return Err(too_long());
+        }
         let mut from = line.from.nozzle_mm;
         for to in pieces(from, line.to.nozzle_mm) {
             moves.push([from, to]);
@@ -234,7 +248,10 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
             row.push(Cost { sum: cost.sum + states.stay(state, ends[1], mm), ..cost });
             before = Some(cost);
         }
-        let (place, best) = least(&row)?;
+        if ways.count > PAIRS_MAX {
+            return Err(too_long());
+        }
+        let (place, best) = least(&row).ok_or_else(never)?;
         let state = first + place;
         // Once the motors follow the file, they no longer come before it.
         let has_begun = first == 0 && state > 0 && {
@@ -247,10 +264,10 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
         costs = row[gone.min(kept)..kept].to_vec();
         first += gone.min(kept);
     }
-    let (place, _) = least(&costs)?;
+    let (place, _) = least(&costs).ok_or_else(never)?;
     let end = first + place;
     if end == 0 {
-        return None;
+        return Err(never());
     }
     let mut layers = distances(&moves, &states, &ways, end);
     // The file's last point ends the motors' path, or is before the last line that the motors went.
@@ -267,7 +284,7 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
         let height_mm = heights.entry(point.layer).or_insert(f64::INFINITY);
         *height_mm = height_mm.min(point.nozzle_mm[2]);
     }
-    Some(Comparison {
+    Ok(Comparison {
         all: layers.values().copied().fold(Distances::default(), Distances::join),
         layers: layers.into_iter().map(|(layer, found)| (layer, heights[&layer], found)).collect(),
         ends_at_line,
@@ -333,7 +350,7 @@ mod tests {
 
     fn asked(places: &[[f64; 3]]) -> AskedPath {
         let line = |(e, [x, y, z]): (u32, &[f64; 3])| format!("G1 X{x} Y{y} Z{z} E{e}\n");
-        AskedPath::parse(&(0..).zip(places).map(line).collect::<String>(), "a.gcode").unwrap()
+        AskedPath::read((0..).zip(places).map(line).collect::<String>().as_bytes(), "a.gcode").unwrap()
     }
 
     /// A square spiral, out and back over its own lines, and up.
@@ -392,7 +409,7 @@ mod tests {
         all.extend([[0.0, 220.0, 30.0], [10.0, 200.0, 30.0]]);
         let found = compare(&path(&all, 2.0), &asked(&places)).unwrap();
         assert!(found.all.greatest_mm < 1e-6 && found.ends_at_line.is_none(), "{found:?}");
-        assert!(compare(&path(&all[..4], 2.0), &asked(&places)).is_none(), "the file never began");
+        assert!(compare(&path(&all[..4], 2.0), &asked(&places)).is_err(), "the file never began");
     }
 
     #[test]

@@ -9,8 +9,17 @@ pub(crate) mod drawing;
 pub(crate) mod moves;
 pub(crate) mod solid;
 
+use std::f64::consts::PI;
+
 use crate::engine::recorder::PathPoint;
 use crate::engine::time::seconds;
+
+/// The cross section of filament 1.75 mm thick.
+const FILAMENT_MM2: f64 = PI * 1.75 * 1.75 / 4.0;
+/// Least width and height of a line of filament.
+const THINNEST_MM: f64 = 0.1;
+/// The filament on a line may be off by this number of steps of the extruder. Each end of the line is up to a step off.
+const STEPS_OFF: f64 = 2.0;
 
 /// A line of the path, from one point to the next.
 #[derive(Clone, Copy)]
@@ -37,6 +46,10 @@ impl Line<'_> {
     fn is_laid(&self) -> bool {
         self.to.laid_mm > 0.0 && self.mm() > 0.0
     }
+
+    fn height_mm(&self) -> f64 {
+        f64::from(self.to.height_mm).max(THINNEST_MM)
+    }
 }
 
 /// The lines of a path. No line leads over a gap.
@@ -45,9 +58,49 @@ fn lines(points: &[PathPoint]) -> impl Iterator<Item = Line<'_>> + Clone {
     points.iter().zip(points.iter().skip(1)).map(line).filter(|line| !line.to.is_start)
 }
 
+/// The lines of filament that follow each other without a travel, in one layer. `step_mm`: a step of the extruder.
+fn runs<'a>(points: &'a [PathPoint], step_mm: f64) -> Vec<Vec<Line<'a>>> {
+    let mut runs: Vec<Vec<Line<'_>>> = Vec::new();
+    // Lines behind the last run on which nothing was laid.
+    let mut empty: Vec<Line<'_>> = Vec::new();
+    for line in lines(points) {
+        let is_next = |last: &Line<'_>| std::ptr::eq(last.to, line.from) && last.to.layer == line.to.layer;
+        let run = runs.last_mut().filter(|run| empty.last().or(run.last()).is_some_and(is_next));
+        if line.is_laid() {
+            // The extruder may make no step on a short line. It makes one on the shortest travel.
+            let travel_mm = step_mm * FILAMENT_MM2 / (THINNEST_MM * line.height_mm());
+            match run.filter(|_| empty.iter().map(Line::mm).sum::<f64>() <= travel_mm) {
+                Some(run) => run.extend(empty.drain(..).chain([line])),
+                None => {
+                    empty.clear();
+                    runs.push(vec![line]);
+                }
+            }
+        } else {
+            // A retraction or a drop ends the run.
+            let fed_mm = line.to.filament_mm - line.from.filament_mm;
+            match run.filter(|_| fed_mm.abs() <= STEPS_OFF * step_mm) {
+                Some(_) => empty.push(line),
+                None => empty.clear(),
+            }
+        }
+    }
+    runs
+}
+
 /// The distance of two points.
 fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Longest piece of a line that is laid as a whole beside another path. The cost of a way then grows step by step.
+const PIECE_MM: f64 = 2.0;
+/// Highest number of pieces of a path that is compared: 64 bytes of memory each.
+const PIECES_MAX: f64 = 8_388_608.0;
+
+/// The number of pieces of a line.
+fn count_pieces(from: [f64; 3], to: [f64; 3]) -> f64 {
+    (distance(from, to) / PIECE_MM).ceil().max(1.0)
 }
 
 /// The point on a line that is nearest to a place.
@@ -96,7 +149,7 @@ mod tests {
         moves::write_gcode(&points, &mut text).unwrap();
         let text = String::from_utf8(text).unwrap();
         assert!(text.contains("G1 X30.0000 Y5.0000 Z0.2000 E0.7000 F3000.0\n"), "{text}");
-        let asked = asked::AskedPath::parse(&text, "a").unwrap();
+        let asked = asked::AskedPath::read(text.as_bytes(), "a").unwrap();
         let places: Vec<_> = asked.points.iter().map(|point| point.nozzle_mm).collect();
         assert_eq!(places, points.iter().map(|point| point.nozzle_mm).collect::<Vec<_>>());
         assert!((asked.filament_mm - 1.7).abs() < 1e-6);
@@ -108,7 +161,7 @@ mod tests {
             path(&[([10.0, 5.0, 0.2], 0.0), ([30.0, 5.0, 0.2], 0.7), ([30.0, 50.0, 0.2], 0.0), ([1.0, 2.0, 0.4], 1.0)]);
         points[3].layer = 2;
         let mut svg = Vec::new();
-        drawing::write_svg(&points, &mut svg).unwrap();
+        drawing::write_svg(&points, 0.01, &mut svg).unwrap();
         let svg = String::from_utf8(svg).unwrap();
         for part in [
             "<g id=\"layer-1\">\n<path class=\"s7\" d=\"M10.00 -5.00L30.00 -5.00\"/>\n<path class=\"s8\" d=\"M30.00 -5.00L30.00 -50.00\"/>",
@@ -118,8 +171,16 @@ mod tests {
         ] {
             assert!(svg.contains(part), "{part} is not in\n{svg}");
         }
+        // A line without a step of the extruder, which is too short for one.
+        points[2].nozzle_mm = [30.0, 5.2, 0.2];
+        points[3].layer = 1;
+        let mut svg = Vec::new();
+        drawing::write_svg(&points, 0.01, &mut svg).unwrap();
+        let svg = String::from_utf8(svg).unwrap();
+        assert!(svg.contains("<path class=\"s7\" d=\"M10.00 -5.00L30.00 -5.00\"/>"), "{svg}");
+        assert!(!svg.contains("<path class=\"s8\" d=\"M30.00"), "{svg}");
         let mut empty = Vec::new();
-        drawing::write_svg(&[], &mut empty).unwrap();
+        drawing::write_svg(&[], 0.01, &mut empty).unwrap();
         assert!(empty.ends_with(b"</svg>\n"));
     }
 }

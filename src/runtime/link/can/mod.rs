@@ -38,6 +38,8 @@ const MACHINE_ID: &str = "/etc/machine-id";
 const FULL_PAUSE: Duration = Duration::from_millis(1);
 /// How long to wait before an interface that is gone is looked for again.
 const REOPEN: Duration = Duration::from_secs(1);
+/// Highest number of frames that one read takes.
+const FRAMES_MAX: usize = 256;
 const NAME_ONE: &str = "name a CAN interface (ip link show type can)";
 /// A frame of another kind than 11-bit data never fits this.
 const FILTER_MASK: u32 = libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
@@ -337,9 +339,10 @@ impl Link for CanBus {
         if std::mem::take(&mut self.is_renewed) && self.is_met {
             return Ok(Heard::Gone);
         }
-        let mut len = 0;
-        // A whole frame must fit.
-        while buffer.len() - len >= FRAME_BYTES_MAX && !self.is_renewed {
+        let (mut len, mut frames) = (0, 0);
+        // A whole frame must fit. Frames without bytes for the MCU must not keep the link, however many there are.
+        while buffer.len() - len >= FRAME_BYTES_MAX && !self.is_renewed && frames < FRAMES_MAX {
+            frames += 1;
             let State::Open(socket) = &self.state else {
                 if self.due().is_some_and(|due| monotonic() >= due) {
                     self.reopen();
@@ -361,7 +364,10 @@ impl Link for CanBus {
         if self.is_renewed
             && let State::Open(socket) = &self.state
         {
-            self.filter(socket)?;
+            if let Err(error) = self.filter(socket) {
+                // The interface is gone.
+                return Ok(self.failed(&error));
+            }
             // It may have been set since the start. The new host reads the dictionary after this.
             self.node.shared().set_frequency(bitrate(&self.interface));
             self.is_renewed = self.is_met;
@@ -394,14 +400,13 @@ impl Link for CanBus {
         Ok(written)
     }
 
-    fn meet_host(&mut self) -> io::Result<bool> {
+    fn meet_host(&mut self) -> bool {
         self.is_met = true;
-        Ok(true)
+        true
     }
 
-    fn part_from_host(&mut self) -> io::Result<()> {
+    fn part_from_host(&mut self) {
         self.is_met = false;
-        Ok(())
     }
 
     fn intrusion(&mut self) -> Option<Shutdown> {

@@ -54,9 +54,9 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
         })
     };
     config.parts = vec![driver("x"), driver("y")];
-    config.spi_buses[1].trace_file = Some(folder.path().join("trace"));
     config.spi_buses[1].trace_pins = vec!["led".into(), "beeper".into()];
     let mut bench = Bench::new(config);
+    bench.probe.record_spi(std::fs::File::create(folder.path().join("trace")).unwrap());
     let led = bench.output("led", true);
     let [mut x, mut y] = ["x_cs", "y_cs"].map(|pin| bench.spi("spidev1.0", Some(pin)).unwrap());
     assert_eq!(exchange(&mut x, "8000000004"), "0900000000");
@@ -68,11 +68,11 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
     assert_eq!(exchange(&mut nobody, "0000"), "ffff", "pulled up");
     assert_eq!(
         std::fs::read_to_string(folder.path().join("trace")).unwrap(),
-        "chips=tmc5160 x sent=8000000004 received=0900000000 led=11111 beeper=00000\n\
-         chips=tmc5160 y sent=0000000000 received=0900000000 led=11111 beeper=00000\n\
-         chips=tmc5160 x sent=0000000000 received=0900000004 led=00000 beeper=00000\n\
-         chips=tmc5160 y sent=0000000000 received=0900000008 led=00000 beeper=00000\n\
-         chips= sent=0000 received=ffff led=00 beeper=00\n"
+        "bus=spidev1.0 chips=tmc5160 x sent=8000000004 received=0900000000 led=11111 beeper=00000\n\
+         bus=spidev1.0 chips=tmc5160 y sent=0000000000 received=0900000000 led=11111 beeper=00000\n\
+         bus=spidev1.0 chips=tmc5160 x sent=0000000000 received=0900000004 led=00000 beeper=00000\n\
+         bus=spidev1.0 chips=tmc5160 y sent=0000000000 received=0900000008 led=00000 beeper=00000\n\
+         bus=spidev1.0 chips= sent=0000 received=ffff led=00 beeper=00\n"
     );
 }
 
