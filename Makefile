@@ -157,10 +157,11 @@ bench: system-packages-build
 check: system-packages-check
 	'$(CARGO)' fmt --all --check
 	@# With the parts of the fuzz targets in the program. For 32 bits, if Rust can compile for them: the tests compile
-	@# everything for 64 bits anyway. Nothing is linked, so there may be no libFuzzer. What is a cast on one may be
-	@# none on the other.
+	@# everything for 64 bits anyway. Nothing is linked, so there is no libFuzzer, and no C compiler for them. What is a
+	@# cast on one may be none on the other.
 	@small= && casts= && if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
-	    small='--target $(SMALL)' && casts='-A clippy::unnecessary_cast' && export CUSTOM_LIBFUZZER_PATH=/none/libfuzzer.a; \
+	    small='--target $(SMALL)' && casts='-A clippy::unnecessary_cast' && export CUSTOM_LIBFUZZER_PATH=/none/libfuzzer.a \
+	    $(addsuffix _$(subst -,_,$(SMALL))=true,CC AR); \
 	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi; \
 	set -ex; '$(CARGO)' clippy --locked --workspace --all-targets $$small -- -D warnings --cfg fuzzing $$casts; \
 	export RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links'; \
