@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -43,7 +44,10 @@ impl AtTerminal {
         let end = || Stdio::from(slave.try_clone().unwrap());
         resize(&slave, rows, 100);
         let before = tcgetattr(&slave).unwrap();
-        let child = command.stdin(end()).stdout(end()).stderr(log.unwrap_or_else(end)).spawn().unwrap();
+        command.stdin(end()).stdout(end()).stderr(log.unwrap_or_else(end));
+        // A group of its own, as a shell gives it. In a group whose parents are all in other sessions, as the tests' may
+        // be, the kernel stops no process by SIGTSTP.
+        let child = command.process_group(0).spawn().unwrap();
         AtTerminal { child, master: Some(master), slave, before, shown: Vec::new(), at_key: 0 }
     }
 
