@@ -17,7 +17,7 @@ use pinion_firmware::lateness::{Lateness, us};
 
 use super::complete::offering;
 use super::computer::Computer;
-use super::computer::running::print_at_risk;
+use super::computer::running::{print_at_risk, print_of_another};
 use super::failed;
 use super::files::Output;
 use super::page::{Page, print};
@@ -44,8 +44,12 @@ pub(super) struct LatencyArgs {
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
-    if let Some(why) = print_at_risk(&Computer::at(Path::new("/"))) {
+    let computer = Computer::at(Path::new("/"));
+    if let Some(why) = print_at_risk(&computer) {
         return failed(format!("the latency is not measured: {why}"));
+    }
+    if let Some(whose) = print_of_another(&computer) {
+        log::warn!("{whose}");
     }
     if let Some(pin) = &args.pin {
         let measured = pin::measure(pin, args.fast_gpio);

@@ -53,7 +53,7 @@ pub fn write(trace: &Trace, last: Duration, out: &mut impl Write) -> io::Result<
     let from_width = widest(&mut rows.iter().map(|row| &row.from));
     let to_width = widest(&mut rows.iter().map(|row| &row.to));
     let thread_width = widest(&mut rows.iter().map(|row| &row.thread)).min(THREAD_WIDTH_MAX);
-    writeln!(out, "Times are in ms. Zero is the end of the recording: {}.", history.end())?;
+    writeln!(out, "Times are in ms. Zero is when {}.", history.end())?;
     for Row { from, to, thread, text } in rows.iter().take(LINES_MAX) {
         let dots = if to.is_empty() { "  " } else { ".." };
         writeln!(out, "{from:>from_width$} {dots} {to:>to_width$}  {thread:thread_width$}  {text}")?;
@@ -303,10 +303,7 @@ mod tests {
     #[test]
     fn what_is_of_note_stands_alone_and_all_else_is_folded() {
         let text = text(|out| write(&late_host(), Duration::MAX, out));
-        assert_eq!(
-            text.lines().next(),
-            Some("Times are in ms. Zero is the end of the recording: the MCU stopped: Timer too close.")
-        );
+        assert_eq!(text.lines().next(), Some("Times are in ms. Zero is when the MCU stopped: Timer too close."));
         for line in [
             "-1000.00             link      a host opened the terminal",
             " -998.00 .. -517.60  spi0      25 transfers, longest 0.400 ms",

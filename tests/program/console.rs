@@ -66,6 +66,13 @@ fn a_script_ends_at_its_first_error_and_tells_the_line() {
     assert!(log.contains("line 3: there is no command get_clok; did you mean get_clock?"), "{log}");
     assert_eq!(text(&output.stdout).matches("] uptime ").count(), 1);
 
+    // The console stops reading at 1 MiB.
+    let longest = "x".repeat((1 << 20) - 1);
+    for (line, trouble) in [(format!("{longest}\n"), "it is too long"), (longest, "there is no command xxx")] {
+        let log = text(&console(&["--board", "sim"], &format!("get_uptime\n{line}")).stderr);
+        assert!(log.contains(&format!("line 2: {trouble}")), "{}", &log[..log.len().min(300)]);
+    }
+
     let (_folder, file) = folder_with("script", "get_uptime\nconfig_endstop oid=0 pin=x_endstp pull_up=1\n");
     let output = console(&["--board", "sim", "-f", file.to_str().unwrap()], "");
     let log = text(&output.stderr);

@@ -3,12 +3,14 @@
 //! drops ssh's options and the host, and runs the command on this computer.
 
 use std::fs;
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
@@ -170,6 +172,35 @@ fn an_attach_that_hears_nothing_gives_the_terminal_back() {
     assert!(log.contains("the host's computer has said nothing for 5 s: look at the network"), "{log}");
     assert!(!far.log().contains("host attached"), "{}", far.log());
     drop(input);
+}
+
+#[test]
+fn an_attach_gives_its_pipes_back_as_they_were() {
+    let far = Pinion::simulated(&[]);
+    for is_killed in [false, true] {
+        let (input, writer) = io::pipe().unwrap();
+        let (mut reader, output) = io::pipe().unwrap();
+        let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(["attach", "-I"])
+            .arg(far.link())
+            .stdin(input.try_clone().unwrap())
+            .stdout(output.try_clone().unwrap())
+            .spawn()
+            .unwrap();
+        let waits = |fd: BorrowedFd<'_>| {
+            let flags = fcntl(fd, FcntlArg::F_GETFL).unwrap();
+            !OFlag::from_bits_retain(flags).contains(OFlag::O_NONBLOCK)
+        };
+        reader.read_exact(&mut [0; 1]).unwrap();
+        assert!(!waits(input.as_fd()) && !waits(output.as_fd()), "it does not wait for its pipes");
+        if is_killed {
+            kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM).unwrap();
+        } else {
+            drop(writer);
+        }
+        child.wait().unwrap();
+        assert!(waits(input.as_fd()) && waits(output.as_fd()), "killed: {is_killed}");
+    }
 }
 
 #[test]

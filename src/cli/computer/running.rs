@@ -165,21 +165,11 @@ pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>)
 }
 
 /// Why this computer must not be kept busy: a host may be printing through a Pinion on its pins. A simulated printer
-/// has nothing to spoil.
+/// has nothing to spoil. A process of another user does not count: with one, any user could keep all others from
+/// measuring. [`print_of_another`] tells of it.
 pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
     let proc = computer.path("/proc");
-    let is_simulated = |pinion: &Running| matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)));
-    let of_others = || {
-        let pinions = computer.strangers().into_iter().filter(|process| computer.is_pinion(process));
-        let mut pinions = pinions.map(|process| computer.pinion(&process, None)).filter(|pinion| !is_simulated(pinion));
-        pinions.next().map(|pinion| {
-            format!(
-                "a host may print through process {}, a Pinion of another user, and measuring keeps every processor busy, which makes steps late: measure when that process has ended",
-                pinion.pid
-            )
-        })
-    };
-    let at_risk = computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
+    computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
         let who = match &pinion.unit {
             Some(unit) => format!("Pinion (process {}, {unit})", pinion.pid),
             None => format!("Pinion (process {})", pinion.pid),
@@ -216,8 +206,24 @@ pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
             "{name} (process {}) {is} attached to {who}, and measuring keeps every processor busy, which makes steps late: wait until the print is done, then {stop}; pinion doctor measures gently meanwhile",
             host.pid
         ))
-    });
-    at_risk.or_else(of_others)
+    })
+}
+
+/// Whose print may suffer while this computer is kept busy: a Pinion of another user runs, or a process that is called
+/// so.
+pub(in crate::cli) fn print_of_another(computer: &Computer) -> Option<String> {
+    let pinions = computer.strangers().into_iter().filter(|process| computer.is_pinion(process));
+    let mut pinions = pinions.map(|process| computer.pinion(&process, None)).filter(|pinion| !is_simulated(pinion));
+    pinions.next().map(|pinion| {
+        format!(
+            "process {} may be a Pinion of another user: if a host prints through it, this makes its steps late",
+            pinion.pid
+        )
+    })
+}
+
+fn is_simulated(pinion: &Running) -> bool {
+    matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)))
 }
 
 #[cfg(test)]
@@ -278,6 +284,19 @@ mod tests {
         }
         tree.put("proc/7/cgroup", "4:pids:/\n1:name=systemd:/system.slice/klipper.service\n0::/\n");
         assert_eq!(tree.computer().starter_of(7), Starter::Unit("klipper".into()));
+    }
+
+    #[test]
+    fn a_false_process_of_another_user_keeps_nobody_from_measuring() {
+        let tree = Tree::new();
+        tree.put("proc/7/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
+        tree.process(7, &["pinion"], MALLORY, &[]);
+        assert_eq!(print_at_risk(&tree.computer()), None);
+        let told = print_of_another(&tree.computer()).unwrap();
+        assert!(told.starts_with("process 7 may be a Pinion of another user"), "{told}");
+        tree.process(7, &["pinion"], 0, &[]);
+        assert!(print_at_risk(&tree.computer()).is_some());
+        assert_eq!(print_of_another(&tree.computer()), None);
     }
 
     #[test]

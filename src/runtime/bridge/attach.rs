@@ -14,11 +14,14 @@ use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg, OFlag};
 use nix::poll::{PollFd, PollFlags, poll};
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
+use signal_hook::consts::{SIGINT, SIGTERM};
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{monotonic, poll_timeout};
 
+use super::super::link::stdio::Lent;
 use super::super::refused;
+use super::super::signals::hang_up;
 use super::{Flow, Heard, SILENCE_MAX, SYNC, Wire, read_some, write_some};
 
 /// How long the host's last bytes may wait for the MCU. A stop may be among them.
@@ -40,6 +43,9 @@ pub(crate) fn attach(link: &Path) -> Result<(), Trouble> {
     }
     let terminal = open(link)?;
     let lost = |error: io::Error| refused(link.display(), error).remedy(START);
+    // Other programs may use them afterwards, with the same flags.
+    let ends: Vec<i32> = hang_up().map_err(broken)?.into_iter().chain([SIGINT, SIGTERM]).collect();
+    let _lent = Lent::take(&ends)?;
     let own = |fd: &dyn AsFd| fd.as_fd().try_clone_to_owned();
     let mut wire = own(&stdin).and_then(|stdin| Wire::new(stdin, own(&stdout)?)).map_err(broken)?;
     let mut inward = Flow::new();

@@ -28,6 +28,7 @@ use super::super::refused;
 use super::super::served::served;
 use super::super::terminal_group::{CLOSED, TerminalGroup};
 use super::{Heard, Link};
+use crate::own_folder::OwnFolder;
 
 /// The folder where others leave files in the link's place.
 const TMP: &str = "/tmp";
@@ -82,6 +83,12 @@ impl Pty {
         }
         let pty = Pty::unlinked(symlink, access)?;
         place_symlink(&pty.device, symlink)?;
+        if let Err(error) = OwnFolder::open(folder_of(symlink)) {
+            warn!(
+                "another user can replace the link {}, and hosts then find another program: {error}: choose a path in a folder of your own with -I",
+                symlink.display()
+            );
+        }
         Ok(pty)
     }
 
@@ -162,11 +169,14 @@ impl Pty {
     }
 }
 
+fn folder_of(link: &Path) -> &Path {
+    link.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Waits until no other program is about to serve a link in this folder. It gives up when that takes too long, because
 /// another user may hold the lock.
 fn turn(symlink: &Path) -> Option<Flock<File>> {
-    let folder = symlink.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut folder = File::open(folder).ok()?;
+    let mut folder = File::open(folder_of(symlink)).ok()?;
     let until = monotonic() + TURN_MAX;
     loop {
         match Flock::lock(folder, FlockArg::LockExclusiveNonblock) {

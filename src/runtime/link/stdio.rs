@@ -37,7 +37,38 @@ struct Before {
     settings: Option<Termios>,
 }
 
-/// Gives standard input and output back as they were. Does nothing if no link has changed them.
+/// Standard input and output, in use until this is dropped. Then they are given back.
+pub(in crate::runtime) struct Lent(());
+
+impl Lent {
+    /// Call this before the program changes one of them. `more` are signals that end the program at once, beside those
+    /// that always do.
+    ///
+    /// # Errors
+    ///
+    /// The kernel refuses them, or a thread.
+    pub(in crate::runtime) fn take(more: &[i32]) -> Result<Lent, Trouble> {
+        give_back_at_signal(more)?;
+        let remember = |fd: BorrowedFd<'_>| -> io::Result<()> {
+            let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
+            let before = Before { fd: fd.try_clone_to_owned()?, flags, settings: tcgetattr(fd).ok() };
+            BEFORE.lock().unwrap_or_else(PoisonError::into_inner).push(before);
+            Ok(())
+        };
+        let both = remember(io::stdin().as_fd()).and_then(|()| remember(io::stdout().as_fd()));
+        both.map(|()| Lent(())).map_err(|error| {
+            refused("standard input and output cannot be used", error).remedy("let ssh or socat start Pinion")
+        })
+    }
+}
+
+impl Drop for Lent {
+    fn drop(&mut self) {
+        give_back();
+    }
+}
+
+/// Gives standard input and output back as they were. Does nothing if they are not lent.
 pub(crate) fn give_back() {
     let before = std::mem::take(&mut *BEFORE.lock().unwrap_or_else(PoisonError::into_inner));
     // In reverse order, because both may be one file.
@@ -48,9 +79,9 @@ pub(crate) fn give_back() {
     }
 }
 
-/// Starts a thread that gives them back if a signal ends the program at once.
-fn give_back_at_signal() -> Result<(), Trouble> {
-    let thread = Signals::new(signals::deadly()).and_then(|mut deadly| {
+/// Starts a thread that gives them back if a signal ends the program at once. `more` are signals that do so, too.
+fn give_back_at_signal(more: &[i32]) -> Result<(), Trouble> {
+    let thread = Signals::new(signals::deadly().iter().chain(more)).and_then(|mut deadly| {
         thread::Builder::new().name("stdio".into()).spawn(move || {
             for signal in deadly.forever() {
                 give_back();
@@ -61,8 +92,9 @@ fn give_back_at_signal() -> Result<(), Trouble> {
     started(thread).map(drop)
 }
 
-/// Standard input and output. When this is dropped, they are given back.
+/// Standard input and output.
 pub(super) struct Stdio {
+    _lent: Lent,
     input: OwnedFd,
     output: OwnedFd,
     /// The output had no room. When to try again.
@@ -81,14 +113,15 @@ impl Stdio {
                 .of("--link stdio")
                 .remedy("let socat or ssh start Pinion so, or leave out --link for a host on this computer"));
         }
+        let lent = Lent::take(&[])?;
         let opened = || -> io::Result<Stdio> {
             Ok(Stdio {
+                _lent: lent,
                 input: io::stdin().as_fd().try_clone_to_owned()?,
                 output: io::stdout().as_fd().try_clone_to_owned()?,
                 full_until: None,
             })
         };
-        give_back_at_signal()?;
         let stdio = opened().and_then(|stdio| stdio.prepare().map(|()| stdio));
         stdio.map_err(|error| {
             refused("standard input and output cannot be used", error).remedy("let ssh or socat start Pinion")
@@ -98,22 +131,13 @@ impl Stdio {
     fn prepare(&self) -> io::Result<()> {
         for fd in [&self.input, &self.output] {
             let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
-            let settings = tcgetattr(fd).ok();
-            let before = Before { fd: fd.try_clone()?, flags, settings: settings.clone() };
-            BEFORE.lock().unwrap_or_else(PoisonError::into_inner).push(before);
-            if let Some(mut settings) = settings {
+            if let Ok(mut settings) = tcgetattr(fd) {
                 cfmakeraw(&mut settings);
                 tcsetattr(fd, SetArg::TCSANOW, &settings)?;
             }
             fcntl(fd, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK))?;
         }
         Ok(())
-    }
-}
-
-impl Drop for Stdio {
-    fn drop(&mut self) {
-        give_back();
     }
 }
 

@@ -203,6 +203,11 @@ struct Cost {
 ///
 /// The motors never followed the file, or one of the paths is too long.
 pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Result<Comparison, Trouble> {
+    compare_within(PAIRS_MAX, points, asked)
+}
+
+/// The same, with at most this many pairs.
+fn compare_within(pairs_max: usize, points: &[PathPoint], asked: &AskedPath) -> Result<Comparison, Trouble> {
     let too_long = || Trouble::new("the motors' path is too long to be compared").remedy("print a shorter file");
     let never = || {
         let trouble = Trouble::new("the motors never went along the path of this file");
@@ -248,7 +253,7 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Result<Comparison, Tr
             row.push(Cost { sum: cost.sum + states.stay(state, ends[1], mm), ..cost });
             before = Some(cost);
         }
-        if ways.count > PAIRS_MAX {
+        if ways.count > pairs_max {
             return Err(too_long());
         }
         let (place, best) = least(&row).ok_or_else(never)?;
@@ -351,6 +356,16 @@ mod tests {
     fn asked(places: &[[f64; 3]]) -> AskedPath {
         let line = |(e, [x, y, z]): (u32, &[f64; 3])| format!("G1 X{x} Y{y} Z{z} E{e}\n");
         AskedPath::read((0..).zip(places).map(line).collect::<String>().as_bytes(), "a.gcode").unwrap()
+    }
+
+    #[test]
+    fn paths_with_too_many_pairs_are_refused() {
+        // Each line of the motors is as near to each line of the file.
+        let to_and_fro: Vec<_> = (0..40).map(|n| [100.0 + f64::from(n % 2), 100.0, 0.2]).collect();
+        let (motors, file) = (path(&to_and_fro, 1.0), asked(&to_and_fro));
+        assert!(compare_within(2000, &motors, &file).is_ok());
+        let refused = compare_within(200, &motors, &file).unwrap_err().to_string();
+        assert!(refused.contains("the motors' path is too long to be compared"), "{refused}");
     }
 
     /// A square spiral, out and back over its own lines, and up.

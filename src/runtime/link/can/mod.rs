@@ -13,7 +13,7 @@ use std::time::Duration;
 use log::{info, warn};
 use nix::sys::socket::{AddressFamily, SockFlag, SockProtocol, SockType, setsockopt, socket, sockopt};
 use socketcan::{
-    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanSocket, EmbeddedFrame as _, Frame as _, Socket as _,
+    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanSocket, EmbeddedFrame as _, Id, Socket as _,
     SocketOptions as _, StandardId,
 };
 
@@ -197,7 +197,11 @@ impl CanBus {
     /// Takes a frame in. The number of bytes for the MCU.
     fn take(&mut self, frame: &CanFrame, buffer: &mut [u8]) -> usize {
         let (id, data) = match frame {
-            CanFrame::Data(frame) => (frame.raw_id() as u16, frame.data()),
+            // A new socket takes all frames until it has its filter.
+            CanFrame::Data(frame) => match frame.id() {
+                Id::Standard(id) => (id.as_raw(), frame.data()),
+                Id::Extended(_) => return 0,
+            },
             CanFrame::Remote(_) => return 0,
             CanFrame::Error(error) => {
                 self.note_error(error);
@@ -417,6 +421,8 @@ impl Link for CanBus {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+    use socketcan::{CanRemoteFrame, ExtendedId};
 
     #[test]
     fn error_frames_tell_the_state_of_the_bus() {
@@ -429,6 +435,74 @@ mod tests {
         assert_eq!(state(RESTARTED, 0, CanState::Off), CanState::Active);
         // An overflow of the interface's buffer changes no state.
         assert_eq!(state(CRTL, 0x01, CanState::Warn), CanState::Warn);
+    }
+
+    /// A bus without an interface.
+    fn closed() -> CanBus {
+        CanBus {
+            interface: "can7".into(),
+            node: Node::new(Arc::new(CanNode::new([1, 2, 3, 4, 5, 6], None))),
+            state: State::Gone(Duration::MAX),
+            is_up: true,
+            owes_answer: false,
+            full_until: None,
+            is_met: false,
+            is_renewed: false,
+            intrusion: None,
+        }
+    }
+
+    /// Has the bus take a frame. The bytes for the MCU.
+    fn taken(bus: &mut CanBus, frame: impl Into<CanFrame>) -> Vec<u8> {
+        let mut buffer = [0; FRAME_BYTES_MAX];
+        let len = bus.take(&frame.into(), &mut buffer);
+        buffer[..len].to_vec()
+    }
+
+    #[test]
+    fn only_data_frames_with_the_nodes_own_ids_of_11_bits_mean_something() {
+        const SET: [u8; 8] = [1, 1, 2, 3, 4, 5, 6, 4];
+        let mut bus = closed();
+        // Its lower 11 bits, or its lower 16 bits, are the admin id.
+        for id in [0x3f0, 0x103f0, 0x1fff_03f0] {
+            taken(&mut bus, CanDataFrame::new(ExtendedId::new(id).unwrap(), &SET).unwrap());
+        }
+        let id = |id: u16| StandardId::new(id).unwrap();
+        taken(&mut bus, CanRemoteFrame::new_remote(id(0x3f0), 8).unwrap());
+        taken(&mut bus, CanErrorFrame::new_error(0x3f0, &SET).unwrap());
+        assert_eq!(bus.node.answer_id(), None);
+        taken(&mut bus, CanDataFrame::new(id(0x3f0), &SET).unwrap());
+        assert!(bus.is_renewed && bus.node.answer_id() == Some(0x109));
+        assert_eq!(taken(&mut bus, CanDataFrame::new(id(0x108), b"data").unwrap()), b"data");
+        assert!(taken(&mut bus, CanDataFrame::new(ExtendedId::new(0x108).unwrap(), b"data").unwrap()).is_empty());
+        assert!(taken(&mut bus, CanRemoteFrame::new_remote(id(0x108), 8).unwrap()).is_empty());
+        // Nor does one of these look like another node with our id.
+        taken(&mut bus, CanDataFrame::new(ExtendedId::new(0x109).unwrap(), b"data").unwrap());
+        taken(&mut bus, CanRemoteFrame::new_remote(id(0x109), 8).unwrap());
+        assert!(bus.intrusion.is_none());
+    }
+
+    proptest! {
+        #[test]
+        fn any_frames_are_taken(
+            frames in prop::collection::vec(
+                (any::<u32>(), 0x3ee_u32..0x3f2, 0_u8..5, prop::collection::vec(0_u8..8, 0..9)), 0..60,
+            ),
+        ) {
+            let mut bus = closed();
+            for (any, near, kind, data) in frames {
+                let id = |id: u32| StandardId::new(id as u16).unwrap();
+                let frame: CanFrame = match kind {
+                    0 => CanErrorFrame::new_error(any & libc::CAN_ERR_MASK, &data).unwrap().into(),
+                    1 => CanRemoteFrame::new_remote(id(near), data.len()).unwrap().into(),
+                    2 => CanDataFrame::new(ExtendedId::new(any >> 3).unwrap(), &data).unwrap().into(),
+                    // Ids below 0x110 are the node's, once it has one.
+                    3 => CanDataFrame::new(id(0x100 + any % 0x10), &data).unwrap().into(),
+                    _ => CanDataFrame::new(id(near), &data).unwrap().into(),
+                };
+                prop_assert!(taken(&mut bus, frame).len() <= data.len());
+            }
+        }
     }
 
     #[test]

@@ -11,9 +11,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use pinion_client::Client;
 use pinion_client::serial::{BlockLink, Port};
-use socketcan::{CanDataFrame, CanFrame, CanSocket, EmbeddedFrame as _, Frame as _, Socket as _, StandardId};
+use pinion_client::{Client, Error};
+use pinion_protocol::block::{Sequence, frame};
+use socketcan::{
+    CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame as _,
+    ExtendedId, Frame as _, Socket as _, StandardId,
+};
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, run};
@@ -86,6 +90,16 @@ struct Host {
 impl Host {
     /// Assigns the nodeid, and connects. `faults`: frames in both directions are lost, doubled and swapped.
     fn connect(faults: bool) -> (Host, Client) {
+        Host::try_connect(faults, WAIT).expect("an MCU")
+    }
+
+    /// Tries again and again, as klippy does: Pinion may have no room for the frames of the first try.
+    fn insist() -> (Host, Client) {
+        let mut tries = (0..10).filter_map(|_| Host::try_connect(false, Duration::from_secs(2)).ok());
+        tries.next().expect("an MCU")
+    }
+
+    fn try_connect(faults: bool, wait: Duration) -> Result<(Host, Client), Error> {
         let bus = bus();
         assign(&bus, UUID_BYTES, NODE_ID);
         let (ours, mut theirs) = UnixStream::pair().expect("sockets");
@@ -121,8 +135,9 @@ impl Host {
             }
         });
         let port = Port::from_fd(OwnedFd::from(ours), "the host's end").expect("a socket");
-        let client = Client::new(BlockLink::new(port, WAIT).expect("a session")).expect("an MCU");
-        (Host { is_over, carrier: Some(carrier) }, client)
+        let host = Host { is_over, carrier: Some(carrier) };
+        let client = BlockLink::new(port, wait).and_then(Client::new)?;
+        Ok((host, client))
     }
 }
 
@@ -283,4 +298,176 @@ fn outputs_go_to_their_shutdown_values_when_the_bus_is_cut() {
     assert!(!sim.level(1));
     let (_host, mut client) = Host::connect(false);
     assert!(client.status().expect("an answer").is_shutdown);
+}
+
+/// Highest number of lines of a log that a hostile node may cause: some kinds of lines, each up to its limit.
+const LINES_MAX: usize = 400;
+
+fn id(id: u16) -> StandardId {
+    StandardId::new(id).expect("11 bits")
+}
+
+/// A node that sends as fast as it can, until it is dropped.
+struct Flood {
+    is_over: Arc<AtomicBool>,
+    sender: Option<JoinHandle<u32>>,
+}
+
+impl Flood {
+    /// `round` sends some frames. It is told how many rounds there were.
+    fn start(round: fn(&CanFdSocket, u32)) -> Flood {
+        let bus = CanFdSocket::open(INTERFACE).expect("an interface");
+        let is_over = Arc::new(AtomicBool::new(false));
+        let over = is_over.clone();
+        let sender = thread::spawn(move || {
+            let mut rounds = 0;
+            while !over.load(Ordering::Relaxed) {
+                round(&bus, rounds);
+                rounds += 1;
+            }
+            rounds
+        });
+        Flood { is_over, sender: Some(sender) }
+    }
+
+    /// Ends it. Returns the number of rounds.
+    fn end(mut self) -> u32 {
+        self.is_over.store(true, Ordering::Relaxed);
+        self.sender.take().map_or(0, |sender| sender.join().expect("a bus that takes every frame"))
+    }
+}
+
+impl Drop for Flood {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+        let _ = self.sender.take().map(JoinHandle::join);
+    }
+}
+
+/// Sends a frame. It is lost if the bus has no room.
+fn throw(bus: &CanFdSocket, frame: impl Into<CanFrame>) {
+    let _ = bus.write_frame(&frame.into());
+}
+
+fn throw_data(bus: &CanFdSocket, id: u16, data: &[u8]) {
+    throw(bus, CanDataFrame::new(self::id(id), data).expect("eight bytes"));
+}
+
+/// Frames of all kinds and lengths with the host's id and the admin id. None is a command of the host, and none makes
+/// the node yield its id.
+fn all_kinds(bus: &CanFdSocket, round: u32) {
+    let bytes = [0x7e, 0x40, 0x10, 0xff, 0x00, 0x7e, 0x05, round as u8];
+    // Half blocks that never end, of any length.
+    throw_data(bus, HOST_ID, &[64, 0x10 | round as u8 & 0xf, 1, 2, 3, 4, 5, 6]);
+    for len in 0..=8 {
+        throw_data(bus, HOST_ID, &bytes[..len]);
+    }
+    // Whole blocks with numbers that jump, without a command.
+    let mut block = Vec::new();
+    frame(&[], Sequence::after(round.wrapping_mul(7)), &mut block);
+    throw_data(bus, HOST_ID, &block);
+    // Queries, commands for others, commands cut short, commands for a bootloader, and commands that do not exist.
+    throw_data(bus, ADMIN, &[0]);
+    throw_data(bus, ADMIN, &[1, 9, 9, 9, 9, 9, 9, NODE_ID + 1]);
+    let [a, b, c, d, e, f] = UUID_BYTES;
+    for len in 0..8 {
+        throw_data(bus, ADMIN, &[1, a, b, c, d, e, f, NODE_ID][..len]);
+    }
+    throw_data(bus, ADMIN, &[2, a, b, c, d, e, f, NODE_ID]);
+    throw_data(bus, ADMIN, &[round as u8 | 0x80; 8]);
+    // 29 bits, remote, and FD. The first would be commands if they had 11 bits.
+    for id in [0x3f0, 0x103f0, 0x108, 0x109] {
+        let id = ExtendedId::new(id).expect("29 bits");
+        throw(bus, CanDataFrame::new(id, &[1, a, b, c, d, e, f, NODE_ID + 1]).expect("eight bytes"));
+    }
+    for id in [ADMIN, HOST_ID, HOST_ID + 1] {
+        throw(bus, CanRemoteFrame::new_remote(self::id(id), 8).expect("eight bytes"));
+        let _ = bus.write_frame(&CanFdFrame::new(self::id(id), &[1; 64]).expect("64 bytes"));
+    }
+    // Errors: off the bus, back, and what the controller says.
+    for bits in [0x40, 0x100, 0x04, 0x200, 0x1fff_ffff] {
+        throw(bus, CanErrorFrame::new_error(bits, &[0, 1 << (round % 8), 0, 0, 0, 0, 255, 255]).expect("eight bytes"));
+    }
+}
+
+/// Takes the id, gives it back, and gives it to others, and sends as the host and as the node itself.
+fn all_ids(bus: &CanFdSocket, round: u32) {
+    let [a, b, c, d, e, f] = UUID_BYTES;
+    let node_id = (round % 200) as u8;
+    throw_data(bus, ADMIN, &[0]);
+    throw_data(bus, ADMIN, &[1, a, b, c, d, e, f, node_id]);
+    throw_data(bus, 0x100 + 2 * u16::from(node_id), &[0x7e; 8]);
+    match round % 3 {
+        0 => throw_data(bus, 0x101 + 2 * u16::from(node_id), &[0x7e; 8]),
+        1 => throw_data(bus, ADMIN, &[1, 9, 9, 9, 9, 9, 9, node_id]),
+        _ => {}
+    }
+}
+
+/// The memory of the program, in kB.
+fn memory_kb(program: &Program) -> u64 {
+    let status = sysfs::read(format!("/proc/{}/status", program.pid()));
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("its memory");
+    line.split_whitespace().next().and_then(|kb| kb.parse().ok()).expect("a number")
+}
+
+/// Has a host connect, configure an output and switch it, and stop the MCU.
+fn is_served(program: &mut Program, sim: &GpioSim) {
+    let (_host, mut client) = Host::insist();
+    configure(&mut client, 1, &["config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0"]);
+    run(&mut client, "update_digital_out oid=0 value=1");
+    client.query("get_uptime", &[], "uptime", None).expect("an answer");
+    assert!(sim.level(1));
+    client.emergency_stop().expect("an answer");
+    sysfs::wait_until("the output is off", || !sim.level(1));
+    assert!(client.status().expect("an answer").is_shutdown);
+    assert!(program.is_running());
+    let log = program.log();
+    assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
+}
+
+#[test]
+fn a_node_that_floods_the_bus_keeps_no_output_on_and_no_later_host_away() {
+    let _interface = Interface::new();
+    // Without this the interface takes no FD frames.
+    ip(&format!("link set {INTERFACE} mtu 72"));
+    let sim = GpioSim::new("lab", 8);
+    let mut program = start();
+    let (host, mut client) = Host::connect(false);
+    let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=100000000";
+    configure(&mut client, 1, &[heater]);
+    run(&mut client, "update_digital_out oid=0 value=1");
+    client.query("get_uptime", &[], "uptime", None).expect("an answer");
+    assert!(sim.level(1));
+    let before_kb = memory_kb(&program);
+    let flood = Flood::start(all_kinds);
+    // The host is drowned.
+    drop(host);
+    program.wait_for_line(&["Missed scheduling of next digital out event"]);
+    assert!(!sim.level(1));
+    let rounds = flood.end();
+    assert!(rounds > 100, "{rounds} rounds are no flood");
+    assert!(memory_kb(&program) < before_kb + 8192, "from {before_kb} to {} kB", memory_kb(&program));
+    is_served(&mut program, &sim);
+}
+
+#[test]
+fn a_node_that_takes_and_gives_ids_stops_the_mcu_and_keeps_no_later_host_away() {
+    let _interface = Interface::new();
+    let sim = GpioSim::new("lab", 8);
+    let mut program = start();
+    let (host, mut client) = Host::connect(false);
+    let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0";
+    configure(&mut client, 1, &[heater]);
+    run(&mut client, "update_digital_out oid=0 value=1");
+    client.query("get_uptime", &[], "uptime", None).expect("an answer");
+    assert!(sim.level(1));
+    let flood = Flood::start(all_ids);
+    drop(host);
+    program.wait_for_line(&["Another CAN node assigned this ID"]);
+    sysfs::wait_until("the output is off", || !sim.level(1));
+    thread::sleep(Duration::from_secs(2));
+    let rounds = flood.end();
+    assert!(rounds > 100, "{rounds} rounds are no flood");
+    is_served(&mut program, &sim);
 }
