@@ -1,40 +1,58 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion` and the guest's tests, built for arm64.
+//! `pinion` and the guest's tests, built as `make deb` builds the package for another architecture.
 
 use std::collections::BTreeMap;
 use std::env;
-use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::debian::{RUSTC, Sysroot, TOOL_PREFIX};
+use super::debian::Kernel;
+use pinion_testkit::cache::Cache;
 use pinion_testkit::initramfs::Archive;
 use pinion_testkit::process;
 
-const TARGET: &str = "aarch64-unknown-linux-gnu";
 const TESTS: &str = "raspberry_pi_guest";
-/// The kernel finds it by the name in each program.
-const LOADER: &str = "ld-linux-aarch64.so.1";
 
-/// The programs, each with its name in the guest.
-pub struct Programs(Vec<(&'static str, PathBuf)>);
+/// The programs' architecture. The kernel is arm64's with both, as in a Raspberry Pi OS of 32 bits.
+pub struct Architecture {
+    /// Debian's name, and the value of `--arch`.
+    pub debian: &'static str,
+    /// GNU's name: of the folder of libraries, and the first part of the names of gcc, strip and readelf.
+    gnu: &'static str,
+    /// The kernel finds it by the name in each program.
+    loader: &'static str,
+}
+
+pub const ARCHITECTURES: [Architecture; 2] = [
+    Architecture { debian: "arm64", gnu: "aarch64-linux-gnu", loader: "ld-linux-aarch64.so.1" },
+    Architecture { debian: "armhf", gnu: "arm-linux-gnueabihf", loader: "ld-linux-armhf.so.3" },
+];
+
+/// The programs, and the libraries to build against.
+pub struct Programs {
+    architecture: &'static Architecture,
+    libraries: PathBuf,
+    /// Each with its name in the guest.
+    programs: Vec<(&'static str, PathBuf)>,
+}
 
 impl Programs {
-    /// Builds them with cargo in a separate target folder, because this rustc differs from the usual one.
-    pub fn build(sysroot: &Sysroot) -> Result<Programs, String> {
-        eprintln!("building for arm64");
-        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+    /// Builds them with cargo. Downloads what the cache does not hold yet.
+    pub fn build(architecture: &'static Architecture, cache: &Cache) -> Result<Programs, String> {
+        let _lock = cache.lock()?;
+        eprintln!("building for {}", architecture.debian);
+        let libraries = cache.root().join(architecture.debian);
+        let mut cargo = Command::new("sh");
         cargo
             .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .args(["build", "--locked", "--target", TARGET, "--bin", "pinion", "--test", TESTS])
+            .args(["-c", r#"set -e; prepared=$(scripts/cross "$1" "$2"); eval "$prepared"; shift 2; exec "$@""#, "sh"])
+            .arg(architecture.debian)
+            .arg(&libraries)
+            .arg(env::var_os("CARGO").unwrap_or("cargo".into()))
+            .args(["build", "--locked", "--bin", "pinion", "--test", TESTS])
             .args(["--message-format", "json", "--target-dir"])
             .arg(Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("raspberry-pi"))
-            .env("RUSTC", RUSTC)
-            .env("CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER", format!("{TOOL_PREFIX}gcc"))
-            .env("CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUSTFLAGS", flags(sysroot))
-            // cargo has set it for this program, to libraries of the other rustc.
-            .env_remove("LD_LIBRARY_PATH")
             .env_remove("RUSTC_WRAPPER")
             .env_remove("RUSTFLAGS");
         let messages = process::output(&mut cargo)?;
@@ -49,68 +67,53 @@ impl Programs {
                 .find(|message| message["target"]["name"] == name)
                 .and_then(|message| message["executable"].as_str())
                 .map(|path| (name, PathBuf::from(path)))
-                .ok_or_else(|| format!("cargo built no {name} for arm64"))
+                .ok_or_else(|| format!("cargo built no {name} for {}", architecture.debian))
         };
-        Ok(Programs(vec![program("pinion")?, program(TESTS)?]))
+        Ok(Programs { architecture, libraries, programs: vec![program("pinion")?, program(TESTS)?] })
     }
 
     /// The guest's root folder.
-    pub fn initramfs(&self, sysroot: &Sysroot) -> Result<Archive, String> {
-        let mut archive = Archive::with_busybox(&sysroot.busybox())?;
+    pub fn initramfs(&self, kernel: &Kernel) -> Result<Archive, String> {
+        let Architecture { gnu, loader, .. } = self.architecture;
+        let mut archive = Archive::with_busybox(&kernel.busybox())?;
         archive.program("/init", include_bytes!("init.sh"));
         let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
         let mut libraries = BTreeMap::new();
-        for (name, path) in &self.0 {
+        for (name, path) in &self.programs {
             let copy = stripped.path().join(name);
-            process::run(
-                Command::new(format!("{TOOL_PREFIX}strip")).arg("--strip-debug").arg("-o").arg(&copy).arg(path),
-            )?;
+            process::run(Command::new(format!("{gnu}-strip")).arg("--strip-debug").arg("-o").arg(&copy).arg(path))?;
             archive.copy(&format!("/bin/{name}"), &copy)?;
-            find_libraries(path, sysroot, &mut libraries)?;
+            self.find_libraries(path, &mut libraries)?;
         }
         for (name, path) in &libraries {
             let content = fs::read(path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
-            let folder = if name == LOADER { "/lib" } else { "/lib/aarch64-linux-gnu" };
+            let folder = if name == loader { "/lib".to_owned() } else { format!("/lib/{gnu}") };
             archive.program(&format!("{folder}/{name}"), &content);
         }
         Ok(archive)
     }
-}
 
-/// The standard library and the other libraries come from the sysroot. The C library for linking comes with the cross
-/// compiler.
-fn flags(sysroot: &Sysroot) -> OsString {
-    let mut flags = OsString::from("--sysroot=");
-    flags.push(sysroot.path().join("usr"));
-    for folder in sysroot.library_folders() {
-        flags.push(" -Lnative=");
-        flags.push(&folder);
-        flags.push(" -Clink-arg=-Wl,-rpath-link,");
-        flags.push(&folder);
-    }
-    flags
-}
-
-/// Adds the libraries that the program needs, and the libraries that those need. `ldd` would have to run the program.
-fn find_libraries(program: &Path, sysroot: &Sysroot, found: &mut BTreeMap<String, PathBuf>) -> Result<(), String> {
-    let dynamic = process::output(Command::new(format!("{TOOL_PREFIX}readelf")).args(["-dW"]).arg(program))?;
-    // 0x0000000000000001 (NEEDED)  Shared library: [libiio.so.0]
-    let needed = dynamic
-        .lines()
-        .filter(|line| line.contains("(NEEDED)"))
-        .filter_map(|line| Some(line.split_once('[')?.1.trim_end_matches(']')));
-    for name in needed {
-        if found.contains_key(name) {
-            continue;
+    /// Adds the libraries that the program needs, and the libraries that those need. `ldd` would have to run the program.
+    fn find_libraries(&self, program: &Path, found: &mut BTreeMap<String, PathBuf>) -> Result<(), String> {
+        let gnu = self.architecture.gnu;
+        let dynamic = process::output(Command::new(format!("{gnu}-readelf")).args(["-dW"]).arg(program))?;
+        // 0x0000000000000001 (NEEDED)  Shared library: [libiio.so.0]
+        let needed = dynamic
+            .lines()
+            .filter(|line| line.contains("(NEEDED)"))
+            .filter_map(|line| Some(line.split_once('[')?.1.trim_end_matches(']')));
+        for name in needed {
+            if found.contains_key(name) {
+                continue;
+            }
+            let path = ["lib", "usr/lib"]
+                .map(|folder| self.libraries.join(folder).join(gnu).join(name))
+                .into_iter()
+                .find(|path| path.exists())
+                .ok_or_else(|| format!("{} needs {name}, which is in none of the packages", program.display()))?;
+            found.insert(name.to_owned(), path.clone());
+            self.find_libraries(&path, found)?;
         }
-        let path = sysroot
-            .library_folders()
-            .into_iter()
-            .map(|folder| folder.join(name))
-            .find(|path| path.exists())
-            .ok_or_else(|| format!("{} needs {name}, which is in none of the packages", program.display()))?;
-        found.insert(name.to_owned(), path.clone());
-        find_libraries(&path, sysroot, found)?;
+        Ok(())
     }
-    Ok(())
 }

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Debian's arm64: libraries to build against, busybox, and the kernel with the descriptions of the boards. And the
-//! emulator of a newer Debian.
+//! Debian's kernel of arm64 with the descriptions of the boards, busybox, and the emulator of a newer Debian.
 //!
-//! These packages are only unpacked. The computer's dpkg learns nothing of them. It only gets the compilers, which are
-//! ordinary packages.
+//! These packages are only unpacked. The computer's dpkg learns nothing of them.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -13,21 +11,8 @@ use std::process::Command;
 use super::board::{BOARDS, Board};
 use pinion_testkit::apt::{self, Apt};
 use pinion_testkit::cache::Cache;
-use pinion_testkit::{process, tools};
+use pinion_testkit::process;
 
-/// Rust's compiler as Debian has it: rustup's has no standard library that goes
-/// with Debian's for arm64.
-pub const RUSTC: &str = "/usr/bin/rustc";
-const RUSTC_PACKAGE: &str = "rustc-web";
-/// Cross gcc, strip and readelf begin with it.
-pub const TOOL_PREFIX: &str = "aarch64-linux-gnu-";
-
-/// What the host gets.
-const TOOLS: [&str; 3] = ["gcc-aarch64-linux-gnu", "libc6-dev-arm64-cross", RUSTC_PACKAGE];
-/// What pinion links to; unpacked with all that it depends on.
-const LIBRARY: &str = "libiio-dev";
-/// Unpacked alone.
-const STANDARD_LIBRARY: &str = "libstd-rust-web-dev";
 const BUSYBOX: &str = "busybox-static";
 /// The package which always depends on the newest kernel.
 const KERNEL: &str = "linux-image-arm64";
@@ -52,7 +37,7 @@ impl Emulator {
         let root = cache.root().join("emulator");
         let architecture = process::output(Command::new("dpkg").arg("--print-architecture"))?;
         let apt = Apt::open(&root.join("apt"), architecture.trim(), Some(EMULATOR_RELEASE))?;
-        let packages = Packages::of(&apt, EMULATOR_PACKAGE, Vec::new())?;
+        let packages = Packages::of(&apt, Some(EMULATOR_PACKAGE), Vec::new())?;
         let folder = packages.unpacked(&apt, &root, &format!("QEMU of Debian {EMULATOR_RELEASE}"))?;
         let pattern = folder.join("usr/lib/*/ld-linux*.so.*");
         let mut loaders = glob::glob(&pattern.to_string_lossy()).map_err(|error| error.to_string())?;
@@ -73,33 +58,26 @@ impl Emulator {
     }
 }
 
-/// The unpacked packages of arm64.
-pub struct Sysroot {
+/// The kernel of the boards, and busybox.
+pub struct Kernel {
     /// As `uname -r` will print it.
     pub release: String,
     folder: PathBuf,
 }
 
-impl Sysroot {
+impl Kernel {
     /// Downloads what the cache does not hold yet.
-    pub fn prepare(cache: &Cache) -> Result<Sysroot, String> {
-        install_tools()?;
+    pub fn prepare(cache: &Cache) -> Result<Kernel, String> {
         let _lock = cache.lock()?;
-        let root = cache.root().join("arm64");
+        let root = cache.root().join("arm64-kernel");
         let apt = Apt::open(&root.join("apt"), "arm64", None)?;
         let release = kernel_release(&apt)?;
-        let rustc = installed_version(RUSTC_PACKAGE)?;
-        let alone = vec![format!("{STANDARD_LIBRARY}={rustc}"), BUSYBOX.to_owned(), format!("linux-image-{release}")];
-        let packages = Packages::of(&apt, LIBRARY, alone)?;
-        let folder = packages.unpacked(&apt, &root, &format!("Debian's arm64 with Linux {release}"))?;
-        Ok(Sysroot { release, folder })
+        let packages = Packages::of(&apt, None, vec![BUSYBOX.to_owned(), format!("linux-image-{release}")])?;
+        let folder = packages.unpacked(&apt, &root, &format!("Linux {release} of arm64"))?;
+        Ok(Kernel { release, folder })
     }
 
-    pub fn path(&self) -> &Path {
-        &self.folder
-    }
-
-    pub fn kernel(&self) -> PathBuf {
+    pub fn image(&self) -> PathBuf {
         self.folder.join(format!("boot/vmlinuz-{}", self.release))
     }
 
@@ -109,43 +87,6 @@ impl Sysroot {
 
     pub fn busybox(&self) -> PathBuf {
         self.folder.join("bin/busybox")
-    }
-
-    /// Where its libraries are.
-    pub fn library_folders(&self) -> [PathBuf; 2] {
-        ["lib/aarch64-linux-gnu", "usr/lib/aarch64-linux-gnu"].map(|folder| self.folder.join(folder))
-    }
-}
-
-/// Adds to the host what it lacks.
-fn install_tools() -> Result<(), String> {
-    let missing: Vec<&str> = TOOLS.into_iter().filter(|package| installed_version(package).is_err()).collect();
-    if missing.is_empty() {
-        return Ok(());
-    }
-    let packages = missing.join(" ");
-    if !nix::unistd::geteuid().is_root() {
-        return Err(format!("this suite needs: sudo apt-get install --no-install-recommends {packages}"));
-    }
-    eprintln!("installing {packages}");
-    tools::update_package_lists()?;
-    process::run(
-        Command::new("apt-get")
-            .args(["install", "-qq", "-y", "--no-install-recommends"])
-            // Rather not at all than instead of another Rust.
-            .args(["--no-remove", "-o", "DPkg::Lock::Timeout=120"])
-            .args(missing)
-            .env("DEBIAN_FRONTEND", "noninteractive"),
-    )
-    .map_err(|cause| format!("this suite needs the packages {packages}: {cause}"))
-}
-
-fn installed_version(package: &str) -> Result<String, String> {
-    let state =
-        process::output(Command::new("dpkg-query").args(["-W", "-f", "${db:Status-Status} ${Version}", package]))?;
-    match state.split_once(' ') {
-        Some(("installed", version)) => Ok(version.to_owned()),
-        _ => Err(format!("{package} is not installed")),
     }
 }
 
@@ -164,30 +105,26 @@ fn kernel_release(apt: &Apt) -> Result<String, String> {
 /// Packages to unpack.
 struct Packages {
     /// Unpacked with all that it depends on.
-    whole: &'static str,
+    whole: Option<&'static str>,
     alone: Vec<String>,
     /// Their files' names; they contain the versions.
     files: Vec<String>,
 }
 
 impl Packages {
-    fn of(apt: &Apt, whole: &'static str, alone: Vec<String>) -> Result<Packages, String> {
-        let print = |arguments: &[&str], packages: &[String]| -> Result<Vec<String>, String> {
+    fn of(apt: &Apt, whole: Option<&'static str>, alone: Vec<String>) -> Result<Packages, String> {
+        let print = |action: &str, packages: &[String]| -> Result<Vec<String>, String> {
             let mut command = apt.command("apt-get");
-            command.args(arguments).args(["-qq", "--print-uris"]).args(packages);
+            command.args([action, "-qq", "--print-uris"]).args(packages);
             // 'URI' file size hash
             let list = process::output(&mut command)?;
             Ok(list.lines().filter_map(|line| line.split(' ').nth(1)).map(str::to_owned).collect())
         };
-        let mut files = print(&["install"], &[whole.to_owned()]).map_err(|cause| format!("{NOT_OFFERED}: {cause}"))?;
-        if !alone.is_empty() {
-            files.extend(print(&["download"], &alone).map_err(|cause| {
-                format!(
-                    "apt does not offer all of {}; \
-                     sudo apt-get update && sudo apt-get install {RUSTC_PACKAGE} may help: {cause}",
-                    alone.join(" ")
-                )
-            })?);
+        let mut files = Vec::new();
+        for (action, packages) in [("install", whole.map(str::to_owned).as_slice()), ("download", &alone)] {
+            if !packages.is_empty() {
+                files.extend(print(action, packages).map_err(|cause| format!("{NOT_OFFERED}: {cause}"))?);
+            }
         }
         files.sort();
         Ok(Packages { whole, alone, files })
@@ -221,12 +158,14 @@ impl Packages {
             remove(path)?;
             fs::create_dir_all(path).map_err(|error| describe("create", path, &error))?;
         }
-        process::run(
-            apt.command("apt-get")
-                .args(["install", "-qq", "-y", "--download-only", "-o"])
-                .arg(apt::option("Dir::Cache::archives", &archives))
-                .arg(self.whole),
-        )?;
+        if let Some(whole) = self.whole {
+            process::run(
+                apt.command("apt-get")
+                    .args(["install", "-qq", "-y", "--download-only", "-o"])
+                    .arg(apt::option("Dir::Cache::archives", &archives))
+                    .arg(whole),
+            )?;
+        }
         if !self.alone.is_empty() {
             process::run(apt.command("apt-get").args(["download", "-qq"]).args(&self.alone).current_dir(&archives))?;
         }

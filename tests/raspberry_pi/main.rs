@@ -2,8 +2,8 @@
 //! Pinion on a Raspberry Pi 3 and 4. It runs the tests of `tests/raspberry_pi/guest` against the real driver of the GPIO
 //! chip on an emulated Pi. docs/develop/test-raspberry-pi.md explains its use.
 //!
-//! This is the computer's side, a separate test harness. It builds for arm64. It simulates the world outside the pins,
-//! as the tests request over the console.
+//! This is the computer's side, a separate test harness. It builds for arm64 and armhf. It simulates the world outside
+//! the pins, as the tests request over the console.
 
 mod board;
 mod cross;
@@ -15,8 +15,8 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use board::{BOARDS, Board};
-use cross::Programs;
-use debian::{Emulator, Sysroot};
+use cross::{ARCHITECTURES, Architecture, Programs};
+use debian::{Emulator, Kernel};
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::cache::Cache;
 use vm::{News, Parts, Vm};
@@ -25,14 +25,16 @@ const USAGE: &str = "\
 Usage: cargo test --test raspberry_pi -- [OPTIONS] [FILTERS...]
 
 Runs the tests whose name, as in gpio::an_output_is_seen_from_outside, contains any
-of the filters, on each emulated board. It installs compilers if they are missing and
-you are root, and downloads 150 MB the first time.
+of the filters, on each emulated board with the programs of each architecture. It
+installs compilers if they are missing and you are root, and downloads 200 MB the
+first time.
 
 Options:
   --exact            A filter is a whole name
   --skip FILTER      Leave out the tests whose name contains this
   --nocapture        Show the output of tests that pass, too
   --board BOARD      Only this board: raspi3b or raspi4b
+  --arch ARCH        Only programs of this architecture: arm64 or armhf
   --shell            A shell on the board instead of tests; Ctrl-A X ends it";
 
 /// A failed run exits with libtest's code.
@@ -40,22 +42,18 @@ const FAILED: u8 = 101;
 
 fn main() -> ExitCode {
     let mut shell = false;
-    let mut boards: Vec<&Board> = BOARDS.iter().collect();
+    let (mut machine, mut debian) = (None, None);
     let arguments = Arguments::read(USAGE, |option, value| {
         match option {
             "--shell" => shell = true,
-            "--board" => {
-                let wish = value()?;
-                boards.retain(|board| board.machine == wish);
-                if boards.is_empty() {
-                    return Err(format!("there is no board {wish}"));
-                }
-            }
+            "--board" => machine = Some(value()?),
+            "--arch" => debian = Some(value()?),
             _ => return Ok(false),
         }
         Ok(true)
     });
-    match run(&arguments, &boards, shell) {
+    let ok = chosen(machine.as_deref(), debian.as_deref()).and_then(|systems| run(&arguments, &systems, shell));
+    match ok {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(FAILED),
         Err(cause) => {
@@ -65,25 +63,38 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether every test passed on each board. An error is the suite's own failure.
-fn run(arguments: &Arguments, boards: &[&'static Board], shell: bool) -> Result<bool, String> {
+/// A board with programs of an architecture.
+type System = (&'static Board, &'static Architecture);
+
+/// The systems that the options ask for.
+fn chosen(machine: Option<&str>, debian: Option<&str>) -> Result<Vec<System>, String> {
+    let boards = BOARDS.iter().filter(|board| machine.is_none_or(|machine| machine == board.machine));
+    let architectures = ARCHITECTURES.iter().filter(|one| debian.is_none_or(|debian| debian == one.debian));
+    let systems: Vec<System> = architectures.flat_map(|one| boards.clone().map(move |board| (board, one))).collect();
+    match systems.is_empty() {
+        true => Err("there is no such board, or no such architecture: see --help".to_owned()),
+        false => Ok(systems),
+    }
+}
+
+/// Whether every test passed on each system. An error is the suite's own failure.
+fn run(arguments: &Arguments, systems: &[System], shell: bool) -> Result<bool, String> {
     let cache = Cache::open()?;
-    let sysroot = Sysroot::prepare(&cache)?;
+    let kernel = Kernel::prepare(&cache)?;
     let emulator = Emulator::prepare(&cache)?;
-    let programs = Programs::build(&sysroot)?;
-    let mut archive = programs.initramfs(&sysroot)?;
     let filters: String = arguments.for_libtest().iter().map(|word| format!("{word}\n")).collect();
-    archive.file("/tests/filters", filters.as_bytes());
-    let initramfs = archive.finish();
     let mut ok = true;
     // One after the other: each keeps a processor busy.
-    for board in boards {
-        let parts = Parts { board, emulator: &emulator, sysroot: &sysroot, initramfs: &initramfs };
+    for &(board, architecture) in systems {
+        let programs = Programs::build(architecture, &cache)?;
+        let mut archive = programs.initramfs(&kernel)?;
+        archive.file("/tests/filters", filters.as_bytes());
+        let parts = Parts { board, emulator: &emulator, kernel: &kernel, initramfs: &archive.finish() };
         if shell {
             vm::shell(&parts, &cache)?;
             continue;
         }
-        println!("a {} with Linux {}", board.name, sysroot.release);
+        println!("a {} with Linux {} and programs of {}", board.name, kernel.release, architecture.debian);
         let mut vm = Vm::boot(&parts, &cache)?;
         let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
         let outcome = follow(&mut vm, &mut report, arguments.show_output);

@@ -14,7 +14,7 @@ use nix::unistd::Pid;
 use tempfile::TempDir;
 
 use super::board::Board;
-use super::debian::{Emulator, Sysroot};
+use super::debian::{Emulator, Kernel};
 use super::gpio::{Gpio, LINES, Trigger};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::process;
@@ -55,7 +55,7 @@ pub enum News {
 pub struct Parts<'a> {
     pub board: &'static Board,
     pub emulator: &'a Emulator,
-    pub sysroot: &'a Sysroot,
+    pub kernel: &'a Kernel,
     pub initramfs: &'a [u8],
 }
 
@@ -70,9 +70,9 @@ impl Parts<'_> {
             .args(["-M", machine, "-accel", "tcg", "-display", "none", "-no-reboot", "-serial", "null"])
             .args(TIME)
             .arg("-kernel")
-            .arg(self.sysroot.kernel())
+            .arg(self.kernel.image())
             .arg("-dtb")
-            .arg(self.sysroot.device_tree(self.board))
+            .arg(self.kernel.device_tree(self.board))
             .arg("-initrd")
             .arg(root)
             .arg("-append")

@@ -3,11 +3,9 @@
 
 use std::fs::File;
 use std::io;
-use std::num::NonZeroUsize;
-use std::ptr::NonNull;
+use std::os::fd::AsRawFd;
+use std::ptr::{self, NonNull};
 use std::sync::atomic::{Ordering, fence};
-
-use nix::sys::mman::{MapFlags, ProtFlags, mmap};
 
 /// The registers of a device, mapped into this process. They are never unmapped.
 pub struct Registers {
@@ -31,12 +29,21 @@ impl Registers {
         if about.is_file() && about.len() < start.saturating_add(bytes as u64) {
             return Err(io::Error::other("it is too short"));
         }
-        let length = NonZeroUsize::new(bytes).ok_or(io::ErrorKind::InvalidInput)?;
+        if bytes == 0 {
+            return Err(io::ErrorKind::InvalidInput.into());
+        }
+        // Not nix's mmap: the offset of that has 32 bits on a computer of 32 bits, and the registers of a Raspberry Pi 4
+        // are at 0xfe200000.
         let start = start.try_into().map_err(|_| io::ErrorKind::InvalidInput)?;
-        let rights = ProtFlags::PROT_READ | ProtFlags::PROT_WRITE;
+        let rights = libc::PROT_READ | libc::PROT_WRITE;
         // SAFETY: a new mapping at an address of the kernel's choice touches no memory that is in use.
-        let mapped = unsafe { mmap(None, length, rights, MapFlags::MAP_SHARED, device, start) }?;
-        Ok(Registers { start: mapped.cast(), bytes })
+        let mapped =
+            unsafe { libc::mmap64(ptr::null_mut(), bytes, rights, libc::MAP_SHARED, device.as_raw_fd(), start) };
+        if mapped == libc::MAP_FAILED {
+            return Err(io::Error::last_os_error());
+        }
+        let start = NonNull::new(mapped.cast()).ok_or(io::ErrorKind::InvalidData)?;
+        Ok(Registers { start, bytes })
     }
 
     /// The register at this offset in bytes. `None` if it is not a register's, or lies outside.
