@@ -136,7 +136,7 @@ coverage: system-packages-coverage $(if $(LAB),system-packages-vm)
 PACKAGE ?= pinion-firmware
 # A part of the mutants, such as 7/30: each 30th of them.
 SHARD ?=
-# More options of cargo-mutants, such as MUTANTS='-f src/runtime/**', and those of cargo test. any_commands is slow.
+# More options of cargo-mutants, such as MUTANTS='-f crates/runtime/src/**', and those of cargo test. any_commands is slow.
 MUTANTS ?=
 TESTS ?= -- --skip any_commands
 # Random tests have the same few cases for each mutant, and leave no files.

@@ -11,9 +11,6 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use pinion::FIRMWARE;
-use pinion::runtime::realtime::{self, Processors, Role};
-use pinion::runtime::wakeup::{MarginLimits, Waiter};
 use pinion_firmware::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
@@ -25,6 +22,9 @@ use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
 use pinion_linux::clock::{Monotonic, monotonic, watch_tick};
 use pinion_protocol::vlq::{Reader, Writer};
+use pinion_runtime::FIRMWARE;
+use pinion_runtime::realtime::{self, Processors, Role};
+use pinion_runtime::wakeup::{MarginLimits, Waiter};
 use pinion_testbench::board::{Bench, FakeBoard};
 
 /// 40 kbaud.

@@ -12,6 +12,7 @@ use std::cell::Cell;
 use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
+use pinion_sim::{SimBoard, SimConfig};
 use pinion_testbench::memory::Counting;
 use pinion_testbench::trial;
 
@@ -25,12 +26,12 @@ const TARGETS: &[Target] = &[
     ("commands", commands),
     ("config", pinion::cli::fuzz::config),
     ("dictionary", dictionary::run),
-    ("guardian", pinion::runtime::fuzz::guardian),
-    ("link", pinion::runtime::fuzz::link),
+    ("guardian", pinion_runtime::fuzz::guardian),
+    ("link", link),
     ("printer", printer::run),
     ("printer_cfg", pinion::cli::fuzz::printer_cfg),
-    ("search", pinion::runtime::fuzz::search),
-    ("sources", pinion::klippy::sources::fuzz),
+    ("search", pinion_runtime::fuzz::search),
+    ("sources", pinion_runtime::klippy::sources::fuzz),
     ("status", pinion::cli::fuzz::status),
     ("trace", trace::run),
 ];
@@ -38,6 +39,12 @@ const TARGETS: &[Target] = &[
 /// Any commands to an MCU in virtual time, for hosts of each generation.
 fn commands(bytes: &[u8]) {
     trial::play(bytes);
+}
+
+/// The link between any host and any core.
+fn link(bytes: &[u8]) {
+    let board = |clock| SimBoard::new(SimConfig::default_printer(), clock).expect("the built-in printer");
+    pinion_runtime::fuzz::link(bytes, |clock| Box::new(board(clock)));
 }
 
 static TARGET: OnceLock<fn(&[u8])> = OnceLock::new();

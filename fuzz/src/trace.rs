@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use pinion::trace::file::Trace;
-use pinion::trace::{perfetto, svg, timeline, vcd, verdict};
+use pinion_trace::file::Trace;
+use pinion_trace::{perfetto, svg, timeline, vcd, verdict};
 
 pub fn run(bytes: &[u8]) {
     let _ = Trace::read(bytes);

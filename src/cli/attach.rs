@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::runtime::attach;
+use pinion_runtime::attach;
 
 use super::console::hosts;
 use super::failed;

@@ -18,8 +18,6 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 use pinion_sim::{BedShape, Colour, Look, PartConfig, PathPoint, Recorder, SimConfig, SimProbe, Space};
 
-use crate::runtime;
-
 use super::own_status::OwnStatus;
 use targets::Targets;
 
@@ -103,7 +101,7 @@ impl Camera {
             let Err(error) = thread.and_then(|_| pinion_camera::serve(&listener, printer, look));
             log::error!("the camera shows nothing: {error}: free memory, or raise ulimit -u, and start again");
         });
-        runtime::started(thread)?;
+        pinion_runtime::started(thread)?;
         let url = url(address);
         log::info!("camera: {url}/ in a browser, {url}/stream and {url}/snapshot in Mainsail or Fluidd");
         Ok(())

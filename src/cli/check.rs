@@ -13,17 +13,17 @@ use std::sync::Arc;
 
 use nix::unistd::{AccessFlags, access, geteuid};
 
-use crate::FIRMWARE;
-use crate::foreign::word;
-use crate::runtime::realtime::{self, Processors};
-use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::Inventory;
 use pinion_linux::can;
 use pinion_linux::clock::Monotonic;
+use pinion_linux::foreign::word;
 use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::uart;
+use pinion_runtime::FIRMWARE;
+use pinion_runtime::realtime::{self, Processors};
+use pinion_runtime::{CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid};
 
 use super::computer::Computer;
 use super::computer::manager::{SYSTEMCTL, watchdog_of_systemd};
@@ -165,7 +165,7 @@ fn link(symlink: &Path) -> Finding {
         return Finding::error("symlink", format!("{path}: nothing may be written in {}", folder.display()), remedy);
     }
     // As a rule, this is the program that is about to be restarted.
-    if let Some(served) = runtime::served(symlink)
+    if let Some(served) = pinion_runtime::served(symlink)
         && !leads_to_ours(symlink)
     {
         return Finding::ok("symlink", format!("no other program can serve there meanwhile: {served}"));

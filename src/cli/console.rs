@@ -31,15 +31,15 @@ use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::low_level::emulate_default_handler;
 use termina::escape::csi::DecPrivateModeCode;
 
-use crate::klippy::process::{Process, Search, Terminal as Device, find};
-use crate::own_folder::OwnFolder;
-use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
-use crate::trace::folder::user_state;
 use pinion_client::console::{Console, Next, Vocabulary};
 use pinion_client::{self, Client};
 use pinion_linux::clock::Monotonic;
+use pinion_linux::own_folder::OwnFolder;
+use pinion_runtime::klippy::process::{Process, Search, Terminal as Device, find};
+use pinion_runtime::wakeup::MarginLimits;
+use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
 use pinion_sim::SimBoard;
+use pinion_trace::folder::user_state;
 
 use super::complete::{SIMULATED, offering};
 use super::files;
@@ -82,7 +82,7 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     let done = match &args.board {
         None => {
             let ready = free(&args.pty).and_then(|()| {
-                let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
+                let hang_up = pinion_runtime::hang_up().map_err(|error| error.to_string())?;
                 let signals: Vec<i32> = [SIGQUIT, SIGTERM].into_iter().chain(hang_up).collect();
                 lend_terminal(&signals)
             });
@@ -150,7 +150,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     // The other signals end the MCU in order. Then `signal` says which one it was.
     let terminal = lend_terminal(&[SIGQUIT])?;
     let signal = Arc::new(AtomicUsize::new(0));
-    let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
+    let hang_up = pinion_runtime::hang_up().map_err(|error| error.to_string())?;
     for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
             .map_err(|error| format!("signals cannot be taken in: {error}"))?;
@@ -191,13 +191,13 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
                     log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
                 }
             });
-            if let Err(trouble) = runtime::started(speaking) {
+            if let Err(trouble) = pinion_runtime::started(speaking) {
                 log::error!("the console cannot be started: {trouble}");
             }
         }
     };
     let timing = board.timing();
-    let ended = runtime::run(&options, Box::new(board), timing, recording, helpers, ready);
+    let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, ready);
     drop(terminal);
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -293,7 +293,7 @@ fn converse(console: Console) -> Result<(), String> {
         let gone = gone.clone();
         thread::Builder::new().name("session".into()).spawn(move || attend(console, printer, &inbox, &outbox, &gone))
     };
-    runtime::started(session).map_err(|trouble| trouble.to_string())?;
+    pinion_runtime::started(session).map_err(|trouble| trouble.to_string())?;
     let ended = read_lines(&mut editor, &lines, &answers, &gone);
     if let Some((folder, path)) = history {
         let kept = folder.map_err(|error| error.to_string());

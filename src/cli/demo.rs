@@ -10,11 +10,11 @@ pub(super) mod heater;
 pub(super) mod picture;
 
 use crate::cli::terminal::ERASE_LINE;
-use crate::foreign::plain;
 use heater::{Goal, Heater, Wiring};
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use pinion_client::{Client, Error};
+use pinion_linux::foreign::plain;
 use pinion_protocol::clock::Clock;
 use pinion_sim::Thermistor;
 
@@ -557,7 +557,7 @@ fn heat(
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     fn shown(live: bool) -> String {

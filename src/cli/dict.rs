@@ -10,10 +10,10 @@ use std::sync::Arc;
 
 use clap::Args;
 
-use crate::FIRMWARE;
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::clock::Monotonic;
 use pinion_linux::gpio::FastGpio;
+use pinion_runtime::FIRMWARE;
 
 use super::complete::{BOARDS, DIALECTS, offering};
 use super::failed;

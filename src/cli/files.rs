@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use nix::fcntl::OFlag;
 use nix::unistd::{AccessFlags, access};
 
-use crate::foreign;
+use pinion_linux::foreign;
 
 const MIB: u64 = 1 << 20;
 /// How many names of a new file are tried.

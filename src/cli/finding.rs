@@ -137,7 +137,7 @@ fn plural(count: usize) -> &'static str {
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     fn groups() -> Vec<Group> {

@@ -12,8 +12,8 @@ use std::time::Duration;
 use clap::Args;
 use pinion_linux::gpio::FastGpio;
 
-use crate::runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
 use pinion_firmware::lateness::{Lateness, us};
+use pinion_runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
 
 use super::complete::offering;
 use super::computer::Computer;
@@ -164,7 +164,13 @@ fn draw_scale(svg: &mut String, base: f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::runtime::latency::tests::half;
+    use pinion_firmware::time::Ticks;
+
+    fn half(name: &'static str, late: &[i64]) -> Half {
+        let mut edge = Lateness::default();
+        late.iter().for_each(|late| edge.record(*late));
+        Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
+    }
 
     #[test]
     fn the_picture_shows_both_halves() {

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueHint};
 
-use crate::runtime::{self, Target};
+use pinion_runtime::Target;
 
 use super::{end_by_panic, failed, logging};
 
@@ -59,7 +59,7 @@ pub(super) fn run(args: &LinkArgs) -> ExitCode {
     let link = args.link.clone().unwrap_or_else(|| usual_link(&args.host));
     let ssh = args.ssh.split_whitespace().map(str::to_owned).collect();
     let target = Target { ssh, host: args.host.clone(), remote: args.remote.clone() };
-    runtime::link_over_ssh(&link, target).map_or_else(failed, |()| ExitCode::SUCCESS)
+    pinion_runtime::link_over_ssh(&link, target).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 #[cfg(test)]

@@ -26,9 +26,9 @@ use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
-use crate::foreign::plain;
-use crate::runtime::started;
 use pinion_linux::clock::monotonic;
+use pinion_linux::foreign::plain;
+use pinion_runtime::started;
 
 /// Highest number of lines that may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
@@ -307,7 +307,7 @@ pub(super) fn finish() {
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     #[test]

@@ -12,9 +12,9 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use log::LevelFilter;
 
-use crate::klippy::process::is_pseudo_terminal;
 use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
+use pinion_runtime::klippy::process::is_pseudo_terminal;
 
 mod attach;
 #[cfg(test)]
@@ -58,7 +58,7 @@ pub mod fuzz {
 ///
 /// Without a subcommand it does the same as `pinion run`. It has the command line of klipper_mcu: -r -w -I PATH.
 #[derive(Parser, Debug)]
-#[command(name = "pinion", version = env!("PINION_VERSION"), max_term_width = 100, args_conflicts_with_subcommands = true)]
+#[command(name = "pinion", version = pinion_runtime::VERSION, max_term_width = 100, args_conflicts_with_subcommands = true)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -158,7 +158,7 @@ fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
         // This comes first: the lines in the log's queue are lost when the process has ended.
         logging::finish();
-        crate::runtime::give_back();
+        pinion_runtime::give_back();
         let panic = panic.to_string().replace('\n', " ");
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
         std::process::abort();

@@ -10,8 +10,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use crate::foreign::plain;
-use crate::status::{State, Status};
+use pinion_linux::foreign::plain;
+use pinion_runtime::status::form::{State, Status};
 
 use super::status::ask::ask_at;
 

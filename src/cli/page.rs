@@ -9,7 +9,7 @@
 use std::fmt::{self, Display, Write as _};
 use std::io::{self, Write as _};
 
-use crate::foreign::{plain, plain_json};
+use pinion_linux::foreign::{plain, plain_json};
 
 /// Lines, each with its line feed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -88,8 +88,8 @@ pub(super) fn draw(text: &str) -> io::Result<()> {
 #[cfg(test)]
 pub(in crate::cli) mod tests {
     use super::*;
-    use crate::foreign::is_unseen;
-    use crate::foreign::tests::any_name;
+    use pinion_linux::foreign::is_unseen;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     /// Asserts that only lines leave a printer, and no more of them than with harmless names.

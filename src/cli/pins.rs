@@ -564,11 +564,11 @@ mod tests {
     use super::*;
     use crate::cli::boards::{self, Board};
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
     use pinion_linux::adc::{Channel, Format};
     use pinion_linux::gpio::LineInfo;
     use pinion_linux::pwm;
     use pinion_linux::sysfs::PwmChannel;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
     use serde_json::{Value, json};
 

@@ -10,13 +10,13 @@ use std::sync::Arc;
 use clap::Args;
 use log::LevelFilter;
 
-use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Guardian, Helpers, Options, Recording};
-use crate::trace::folder::folders;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::gpio::FastGpio;
 use pinion_linux::sys;
+use pinion_runtime::wakeup::MarginLimits;
+use pinion_runtime::{Guardian, Helpers, Options, Recording};
+use pinion_trace::folder::folders;
 
 use super::settings::{BoardName, Given, Settings, WATCHDOG};
 use super::{check, config, end_by_panic, failed, logging};
@@ -48,7 +48,7 @@ impl Settings {
             margin: MarginLimits::up_to_us(self.margin_us),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
             trace_edges: self.trace_edges,
-            sockets: self.socket.clone().map_or_else(|| runtime::socket_paths(&self.symlink), |path| vec![path]),
+            sockets: self.socket.clone().map_or_else(|| pinion_runtime::socket_paths(&self.symlink), |path| vec![path]),
         }
     }
 }
@@ -108,7 +108,7 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
         Ok(opened) => opened,
         Err(error) => return failed(error),
     };
-    match runtime::run(&settings.options(), board, timing, recording, helpers, || ()) {
+    match pinion_runtime::run(&settings.options(), board, timing, recording, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

@@ -10,13 +10,13 @@ use std::sync::Arc;
 use clap::{Args, ValueHint};
 use log::LevelFilter;
 
-use crate::runtime::{Access, LinkName};
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::{TimeSource, Timing};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::gpio::FastGpio;
 use pinion_linux::{Guard, LinuxBoard};
+use pinion_runtime::{Access, LinkName};
 use pinion_sim::{SimBoard, SimConfig};
 
 use super::complete::{BOARDS, FAST, SPOKEN, offering};

@@ -18,8 +18,8 @@ use termina::escape::csi::{Csi, DecPrivateModeCode, Sgr};
 use termina::event::KeyCode;
 use termina::style::RgbColor;
 
-use crate::foreign::plain;
 use pinion_linux::clock::monotonic;
+use pinion_linux::foreign::plain;
 use pinion_sim::SimProbe;
 
 use super::own_status::OwnStatus;
@@ -361,7 +361,7 @@ fn show(look: impl Fn() -> Vec<Item>, stopped: &Receiver<()>) -> io::Result<()> 
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     pub(super) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {

@@ -20,13 +20,13 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use super::demo::heater::Goal;
 use super::demo::picture;
 use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
-use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording, realtime};
-use crate::trace::folder::folders;
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
+use pinion_runtime::wakeup::MarginLimits;
+use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
+use pinion_trace::folder::folders;
 
 use super::camera::{self, Camera};
 use super::files::Output;
@@ -117,7 +117,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     let probe = board.probe();
-    let sockets = runtime::socket_paths(&args.symlink);
+    let sockets = pinion_runtime::socket_paths(&args.symlink);
     let own =
         match (args.show || camera.is_some()).then(|| OwnStatus::start(sockets.clone(), &args.symlink)).transpose() {
             Ok(own) => own.unwrap_or_default(),
@@ -160,13 +160,13 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
                 realtime::leave();
                 show(&args, &plan, &probe, picture.as_ref(), (&right, &ended));
             });
-            if let Err(trouble) = runtime::started(demo) {
+            if let Err(trouble) = pinion_runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
             }
         }
     };
     let timing = board.timing();
-    match runtime::run(&options, Box::new(board), timing, recording, helpers, ready) {
+    match pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, ready) {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -219,7 +219,7 @@ fn serve(
         }
     };
     let timing = board.timing();
-    let ended = runtime::run(options, Box::new(board), timing, recording, helpers, ready);
+    let ended = pinion_runtime::run(options, Box::new(board), timing, recording, helpers, ready);
     if let Some(show) = show {
         show.end();
     }

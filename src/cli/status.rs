@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::status::Status;
+use pinion_runtime::status::form::Status;
 
 use super::failed;
 use super::page::{Page, print};
@@ -71,13 +71,13 @@ fn json(status: &Status) -> Page {
 /// For `fuzz/`: any bytes from a socket, and what is printed of them.
 #[cfg(fuzzing)]
 pub fn status(bytes: &[u8]) {
-    let Ok((status, _)) = crate::status::read(bytes) else { return };
+    let Ok((status, _)) = pinion_runtime::status::form::read(bytes) else { return };
     for show in [text::page, prometheus::page, json] {
         let page = show(&status).to_string();
         assert!(!page.contains(|c: char| c.is_control() && c != '\n'), "{page:?}");
     }
     // What is read is written, and read as the same.
-    let again = crate::status::read(json(&status).to_string().as_bytes());
+    let again = pinion_runtime::status::form::read(json(&status).to_string().as_bytes());
     assert_eq!(again.map(|(again, _)| again).ok(), Some(status));
 }
 
@@ -85,7 +85,7 @@ pub fn status(bytes: &[u8]) {
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
     use serde_json::{Value, json};
 
@@ -111,7 +111,7 @@ mod tests {
             "queues": { "moves": { "waiting": 3, "size": 1024 }, "commands": { "waiting": 0, "size": 256, "held": false },
                         "workers": [{ "name": "spi0", "waiting": 1 }] },
         });
-        let (status, unknown) = crate::status::read(document.to_string().as_bytes()).unwrap();
+        let (status, unknown) = pinion_runtime::status::form::read(document.to_string().as_bytes()).unwrap();
         assert_eq!(unknown, [""; 0]);
         status
     }
@@ -136,7 +136,7 @@ mod tests {
             let called = |name: &str| {
                 let mut document = json!(stopped());
                 rename(&mut document, name);
-                crate::status::read(document.to_string().as_bytes()).unwrap().0
+                pinion_runtime::status::form::read(document.to_string().as_bytes()).unwrap().0
             };
             for show in [text::page, prometheus::page, json] {
                 assert_plain(&show(&called(&name)).to_string(), show(&called("x")).lines().count());

@@ -26,7 +26,7 @@ use termina::event::{KeyCode, Modifiers};
 use termina::{Event, OneBased, Parser};
 use terminal_size::{Height, Width, terminal_size_of};
 
-use crate::runtime::started;
+use pinion_runtime::started;
 
 use super::page::draw;
 

@@ -14,13 +14,13 @@ use clap::{Args, ValueHint};
 
 use pinion_firmware::time::NS_PER_TICK;
 
-use crate::foreign;
-use crate::runtime::{socket_paths, trace_socket_paths};
-use crate::trace::event::Event;
-use crate::trace::file::Trace;
-use crate::trace::folder::{all, folders, kept, name_of, utc_text};
-use crate::trace::verdict::verdict;
-use crate::trace::{perfetto, svg, timeline, vcd};
+use pinion_linux::foreign;
+use pinion_runtime::{socket_paths, trace_socket_paths};
+use pinion_trace::event::Event;
+use pinion_trace::file::Trace;
+use pinion_trace::folder::{all, folders, kept, name_of, utc_text};
+use pinion_trace::verdict::verdict;
+use pinion_trace::{perfetto, svg, timeline, vcd};
 
 use super::failed;
 use super::files::Output;

@@ -12,9 +12,9 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
-use pinion::runtime::wakeup::MarginLimits;
-use pinion::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use pinion_linux::clock::Monotonic;
+use pinion_runtime::wakeup::MarginLimits;
+use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -155,8 +155,9 @@ impl Printer {
                 dialect: None,
             };
             let recording = Recording::new(clock, &folder.join("tty"), true, Vec::new()).unwrap();
-            let run =
-                move || runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {}).unwrap();
+            let run = move || {
+                pinion_runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {}).unwrap()
+            };
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");

@@ -13,11 +13,11 @@ use std::time::Duration;
 
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
-use pinion::trace::event::Event;
-use pinion::trace::file::{End, Trace};
 use pinion_client::Client;
 use pinion_protocol::block::{Refusal, Sequence, frame};
 use pinion_testkit::here;
+use pinion_trace::event::Event;
+use pinion_trace::file::{End, Trace};
 
 use crate::process::{Pinion, WAIT_MAX};
 

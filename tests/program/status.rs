@@ -338,7 +338,7 @@ fn a_crowd_is_waited_for_and_then_named() {
     for _ in 0..=crowd.len() {
         let (mut client, _) = listener.accept().unwrap();
         // The crowd does not read.
-        let _ = client.write_all(include_bytes!("../../src/status/recorded.json"));
+        let _ = client.write_all(include_bytes!("../../crates/runtime/src/status/recorded.json"));
     }
     let answered = waiting.wait_with_output().unwrap();
     let page = String::from_utf8_lossy(&answered.stdout);

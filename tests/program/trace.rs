@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::thread;
 
-use pinion::trace::event::Event;
-use pinion::trace::file::{End, Head, Names, Thread, Trace};
 use pinion_firmware::time::{Clock, Ticks};
+use pinion_trace::event::Event;
+use pinion_trace::file::{End, Head, Names, Thread, Trace};
 use serde_json::Value;
 use tempfile::TempDir;
 

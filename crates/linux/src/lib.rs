@@ -25,15 +25,19 @@ use pins::{Names, Target};
 pub mod adc;
 pub mod can;
 pub mod clock;
+pub mod foreign;
 pub mod gpio;
 mod guard;
 pub mod i2c;
+pub mod own_folder;
 pub mod pins;
+pub mod proc;
 pub mod pwm;
 pub mod spi;
 #[allow(unsafe_code)]
 pub mod sys;
 pub mod sysfs;
+pub mod throttled;
 pub mod uart;
 mod w1;
 

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 
 use crate::cli::own_status::OwnStatus;
-use crate::klippy::process;
+use pinion_runtime::klippy::process;
 
 /// Time between two questions.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -65,7 +65,7 @@ impl Targets {
 fn connect(pid: u32) -> Option<UnixStream> {
     let proc = Path::new("/proc");
     let path = process::of(proc, pid)?.klippy_api(proc)?;
-    crate::runtime::status::connect(&path).ok().filter(|socket| socket.set_nonblocking(false).is_ok())
+    pinion_runtime::status::connect(&path).ok().filter(|socket| socket.set_nonblocking(false).is_ok())
 }
 
 /// Asks klippy for the targets of these heaters.

@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 use glob::{MatchOptions, Pattern};
 use nix::unistd::{User, getegid, geteuid, getgroups, getuid};
 
-use crate::foreign;
-use crate::klippy::process::Ids;
+use pinion_linux::foreign;
+use pinion_runtime::klippy::process::Ids;
 
 pub(super) mod device;
 pub(super) mod manager;

@@ -9,10 +9,10 @@ use std::os::unix::fs::MetadataExt;
 
 use crate::cli::settings::{BoardName, Settings};
 use crate::cli::{config, run_args};
-use crate::foreign::word;
-use crate::klippy::HOST_PATHS;
-use crate::klippy::process::{self, Ids, Process, Search};
-use crate::runtime::helpers;
+use pinion_linux::foreign::word;
+use pinion_runtime::helpers;
+use pinion_runtime::klippy::HOST_PATHS;
+use pinion_runtime::klippy::process::{self, Ids, Process, Search};
 
 use super::units::{self, setting};
 use super::{Computer, Who};

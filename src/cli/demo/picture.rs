@@ -6,7 +6,7 @@
 use std::fmt::Write;
 
 use super::{AxisReport, AxisSample, Report};
-use crate::foreign::plain_xml;
+use pinion_linux::foreign::plain_xml;
 
 const WIDTH: f64 = 900.0;
 const LEFT: f64 = 78.0;
@@ -261,7 +261,7 @@ impl Svg {
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
-    use crate::foreign::tests::any_name;
+    use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
     fn assert_well_formed(svg: &str) {

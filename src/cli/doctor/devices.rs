@@ -14,11 +14,11 @@ use crate::cli::computer::device::Port;
 use crate::cli::computer::{Access, Computer, Who, output};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
-use crate::foreign::word;
-use crate::throttled;
 use pinion_linux::Inventory;
+use pinion_linux::foreign::word;
 use pinion_linux::gpio::{Chip, FastGpio, LINK_REMEDY, never_sleeps};
 use pinion_linux::pins::{Names, line_number};
+use pinion_linux::throttled;
 
 use super::instance::Instance;
 use super::printer::line_of;

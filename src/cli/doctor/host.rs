@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 use crate::cli::computer::units::{self, setting};
 use crate::cli::computer::{Computer, Who};
 use crate::cli::finding::Finding;
-use crate::foreign::word;
-use crate::klippy::Checkout;
-use crate::klippy::process::{self, Process};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
+use pinion_linux::foreign::word;
+use pinion_runtime::klippy::Checkout;
+use pinion_runtime::klippy::process::{self, Process};
 
 use super::UPGRADE;
 use super::instance::Instance;
@@ -213,6 +213,7 @@ mod tests {
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
     use pinion_firmware::mcu::Generation;
+    use pinion_runtime::klippy::sources::Shape;
 
     const PI: u32 = 54_321;
 
@@ -260,9 +261,15 @@ mod tests {
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
         told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
-        let forms: Vec<String> = crate::klippy::tests::forms(Generation::V0_12)
-            .iter()
-            .map(|form| {
+        let commands = FEATURES.iter().flat_map(|feature| feature.commands);
+        let responses = FEATURES.iter().flat_map(|feature| feature.responses);
+        let formats = commands.map(|one| (one.format, one.generations));
+        let forms: Vec<String> = formats
+            .chain(responses.map(|one| (one.format, one.generations)))
+            .filter(|(_, generations)| generations.contains(Generation::V0_12))
+            .filter_map(|(format, _)| Shape::of(format))
+            .map(|shape| {
+                let form = shape.as_str();
                 let (name, parameters) = form.split_once(' ').unwrap();
                 let parameters: Vec<String> = parameters.split(' ').map(|name| format!("{name}=%u")).collect();
                 format!("mcu.lookup_command(\"{name} {}\")\n", parameters.join(" "))

@@ -12,8 +12,8 @@ use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
 use crate::cli::run_args;
 use crate::cli::settings::{Given, Settings};
-use crate::foreign::word;
-use crate::klippy::{HOST_PATHS, is_host_path};
+use pinion_linux::foreign::word;
+use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
 
 /// The unit of the usual instance.
 const UNIT: &str = "pinion-mcu";

@@ -5,8 +5,8 @@
 
 use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
-use crate::runtime::realtime::is_preempt_rt;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
+use pinion_runtime::realtime::is_preempt_rt;
 
 use super::instance::Instance;
 

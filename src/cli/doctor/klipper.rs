@@ -8,9 +8,9 @@ use std::path::Path;
 
 use crate::cli::finding::Finding;
 use crate::cli::page::Page;
-use crate::klippy::sources::Shape;
-use crate::klippy::{Checkout, Verdict};
 use pinion_firmware::feature::FEATURES;
+use pinion_runtime::klippy::sources::Shape;
+use pinion_runtime::klippy::{Checkout, Verdict};
 
 use super::UPGRADE;
 

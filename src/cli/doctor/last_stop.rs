@@ -11,9 +11,9 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
 use crate::cli::trace::read;
-use crate::foreign::word;
-use crate::trace::folder::{all, folders, utc_text};
-use crate::trace::verdict::{Culprit, verdict};
+use pinion_linux::foreign::word;
+use pinion_trace::folder::{all, folders, utc_text};
+use pinion_trace::verdict::{Culprit, verdict};
 
 /// An older stop needs no warning.
 const RECENT: Duration = Duration::from_secs(7 * 24 * 3600);
@@ -55,19 +55,31 @@ mod tests {
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level;
-    use crate::trace::file::End;
-    use crate::trace::file::tests::trace;
+    use pinion_trace::file::{End, Head, Names, Trace};
 
     #[test]
     fn the_newest_recording_is_judged() {
         let tree = Tree::new();
         let finding = |at| finding(&tree.computer(), at);
         let hour = Duration::from_secs(3600);
-        let mut newest = trace(End::Died, &[]);
+        let names = Names { is_carried: true, ..Names::default() };
+        let head = Head {
+            version: "pinion-test".into(),
+            link: "/tmp/klipper_host_mcu".into(),
+            wire: None,
+            end: End::Died,
+            ended_at: 0,
+            utc_ms: 1_795_348_800_000,
+            realtime: true,
+            processors: 4,
+            kernel: "6.12.0".into(),
+            names,
+        };
+        let mut newest = Trace { head, threads: Vec::new() };
         let ended = UNIX_EPOCH + Duration::from_millis(newest.head.utc_ms);
         assert_eq!(finding(ended).told.found(), "no stop of the MCU is recorded");
         let path = tree.computer().path("/var/lib/pinion/mcu-20261122T142614.000Z.trace");
-        let put = |trace: &crate::trace::file::Trace| {
+        let put = |trace: &Trace| {
             let mut file = Vec::new();
             trace.write(&mut file).unwrap();
             fs::create_dir_all(path.parent().unwrap()).unwrap();

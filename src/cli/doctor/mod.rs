@@ -12,8 +12,8 @@ use std::time::SystemTime;
 
 use clap::{Args, ValueHint};
 
-use crate::runtime::latency::{self, Fitness, Verdict};
 use pinion_linux::Inventory;
+use pinion_runtime::latency::{self, Fitness, Verdict};
 
 use super::computer::Computer;
 use super::computer::manager::SYSTEMCTL;

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use crate::cli::computer::device::Port;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
-use crate::klippy::process::Process;
+use pinion_runtime::klippy::process::Process;
 
 use super::devices::{is_pi, is_pi5, pi_config};
 

@@ -9,8 +9,8 @@ use crate::cli::computer::manager::watchdog_of_systemd;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::{Finding, Level};
 use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
-use crate::foreign::word;
-use crate::proc::stat_field;
+use pinion_linux::foreign::word;
+use pinion_linux::proc::stat_field;
 
 use super::INSTALL;
 use super::instance::{Instance, is_klipper_s};

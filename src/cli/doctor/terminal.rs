@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 use crate::cli::check;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::{Finding, Level};
-use crate::foreign::word;
-use crate::klippy::{HOST_PATHS, is_host_path};
-use crate::runtime::Place;
+use pinion_linux::foreign::word;
+use pinion_runtime::Place;
+use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
 
 use super::host::{Klippy, printers};
 use super::instance::{Instance, unit_for};

@@ -13,9 +13,9 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde::Deserialize;
 
 use crate::cli::not_permitted;
-use crate::runtime::socket_paths;
-use crate::runtime::status::connect;
-use crate::status::{self, Status};
+use pinion_runtime::socket_paths;
+use pinion_runtime::status::connect;
+use pinion_runtime::status::form::{self as status, Status};
 
 use super::StatusArgs;
 
@@ -81,7 +81,7 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
         version: String,
     }
     let path = path.display();
-    let own = env!("PINION_VERSION");
+    let own = pinion_runtime::VERSION;
     match status::read(document) {
         Ok((status, unknown)) => {
             let notice = (!unknown.is_empty()).then(|| {
@@ -137,7 +137,6 @@ fn document_at(path: &Path, bytes_max: usize) -> io::Result<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::status::tests::recorded;
     use serde_json::json;
 
     fn answered(document: &serde_json::Value) -> Result<Answer, String> {
@@ -146,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_document_of_another_version_is_read_as_far_as_it_is_known_or_refused_by_name() {
-        let status = recorded();
+        let status = status::read(include_bytes!("../../../crates/runtime/src/status/recorded.json")).unwrap().0;
         let mut document = json!(status);
         let same = answered(&document).unwrap();
         assert_eq!((&same.status, &same.notice), (&status, &None));

@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::page::Page;
-use crate::status::{BusCounts, McuStatus, Present, State, Status};
+use pinion_runtime::status::form::{BusCounts, McuStatus, Present, State, Status};
 
 /// How a metric reads the bus counts.
 type Count = fn(&BusCounts) -> u32;

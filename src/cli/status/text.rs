@@ -4,7 +4,9 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::page::{Page, aligned};
-use crate::status::{BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, Recorder, State, Status};
+use pinion_runtime::status::form::{
+    BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, Recorder, State, Status,
+};
 
 /// Width of the column with the heads of the lines.
 pub(super) const HEAD: usize = 10;

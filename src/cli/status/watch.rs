@@ -16,7 +16,7 @@ use termina::event::KeyCode;
 
 use crate::cli::page::{Page, draw};
 use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, give_back_at, off, on, size, to_row};
-use crate::runtime::hang_up;
+use pinion_runtime::hang_up;
 
 use super::ask::ask;
 use super::text::HEAD;

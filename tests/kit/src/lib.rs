@@ -6,6 +6,7 @@
 //! - [`here`]: whether this computer lets a test run
 //! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
 //! - [`browser`]: a page as a person sees it
+//! - [`names`]: names that others chose, for property tests
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
@@ -21,6 +22,7 @@ pub mod here;
 pub mod initramfs;
 pub mod kernel;
 pub mod markdown;
+pub mod names;
 pub mod process;
 pub mod tools;
 

@@ -5,7 +5,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use pinion_shared::together;
+use pinion_sync::together;
 
 /// A few words that belong together. One thread writes them, and any thread reads them whole.
 #[derive(Debug)]

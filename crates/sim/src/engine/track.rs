@@ -9,7 +9,7 @@
 use std::sync::atomic::AtomicU64;
 
 use pinion_firmware::time::Clock;
-use pinion_shared::ring::{Found, Ring, words};
+use pinion_sync::ring::{Found, Ring, words};
 
 /// Number of steps kept: half a second at 32,000 steps per second.
 pub(crate) const KEPT: usize = 1 << 14;

@@ -1,0 +1,295 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A Klipper micro-controller as a Linux process: its threads, its links to the host, its guardian and recorder, and what
+//! it knows about a host from outside ([`klippy`]).
+//!
+//! ```text
+//! host <-way-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
+//!                   <==ring of bytes===      <==ring of answers==
+//! ```
+
+#![forbid(unsafe_code)]
+// Printing panics when nobody reads. The others panic when an assumption is wrong. Tests may use all of them.
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+#![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
+
+use std::fmt;
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use log::{error, info, warn};
+
+use pinion_firmware::board::Board;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::{DialectName, Firmware, Wire};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::Timing;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::{LOOK_AT_LOG, sys};
+
+mod bridge;
+mod budget;
+mod core;
+mod core_end;
+mod core_thread;
+mod forked;
+pub mod guardian;
+pub mod helpers;
+mod host;
+mod host_end;
+mod introduction;
+pub mod klippy;
+pub mod latency;
+mod ledger;
+mod link;
+mod link_thread;
+mod lookout;
+mod notify;
+mod outlet;
+mod oversight;
+mod place;
+mod pulse;
+pub mod realtime;
+mod recorder;
+mod served;
+mod signals;
+pub mod status;
+mod survey;
+mod terminal_group;
+pub mod wakeup;
+mod watchdog;
+mod workers;
+
+/// What the targets in `fuzz/` call.
+#[cfg(fuzzing)]
+pub mod fuzz {
+    pub use super::guardian::fuzz::guardian;
+    pub use super::host::search;
+    pub use super::link_thread::fuzz::link;
+}
+
+pub use bridge::attach::attach;
+pub use bridge::near::link as link_over_ssh;
+pub use bridge::ssh::Target;
+pub use guardian::Guardian;
+pub use helpers::Helpers;
+pub use host::HostSearch;
+pub use link::LinkName;
+pub use link::can::{CanbusUuid, can_open, uuid as can_uuid};
+pub use link::pty::Access;
+pub use link::stdio::give_back;
+pub use place::Place;
+pub use recorder::Recording;
+pub use served::{Served, served};
+pub use signals::hang_up;
+pub use status::{socket_paths, trace_socket_paths};
+pub use terminal_group::{CLOSED, TerminalGroup};
+
+use self::core::{Left, Request};
+use core_thread::{CoreThread, REQUESTS};
+use host_end::HostEnd;
+use introduction::Introduction;
+use link_thread::{End, LinkThread};
+use notify::Notify;
+use outlet::LinkWake;
+use oversight::Oversight;
+use pulse::Pulse;
+use realtime::{Processors, Role};
+use recorder::Recorder;
+use signals::Signals;
+use status::{Facts, HostBoard, StatusSocket};
+use wakeup::MarginLimits;
+use watchdog::{Vigil, Watchdog};
+
+/// Version of the build.
+pub const VERSION: &str = env!("PINION_VERSION");
+
+/// The program's description as an MCU.
+pub const FIRMWARE: Firmware = Firmware {
+    features: FEATURES,
+    app: "Pinion",
+    version: concat!("pinion-", env!("PINION_VERSION")),
+    build_versions: concat!("rustc: ", env!("PINION_COMPILER")),
+    license: "GNU GPLv3",
+    wire: Wire::Terminal,
+};
+
+/// How the program runs.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The way to the host.
+    pub link: LinkName,
+    /// Who may open a pseudo terminal.
+    pub access: Access,
+    /// Whether to ask for real-time scheduling.
+    pub realtime: bool,
+    /// How early the core may wake for a timer.
+    pub margin: MarginLimits,
+    /// The dialect to speak. `None`: the dialect of the host that comes.
+    pub dialect: Option<DialectName>,
+    /// The hardware watchdog to feed.
+    pub watchdog: Option<PathBuf>,
+    /// The only processor that the core runs on.
+    pub cpu: Option<usize>,
+    /// Whether the flight recorder notes each edge of each output.
+    pub trace_edges: bool,
+    /// Possible paths of the status socket: the first one that works is used. Without any there is no socket.
+    pub sockets: Vec<PathBuf>,
+}
+
+/// Serves a host until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
+/// `board` by `timing`, and the instants of `timing` are those of the recording's clock. `helpers` has the guardian of
+/// the board's outputs.
+pub fn run(
+    options: &Options,
+    board: Box<dyn Board>,
+    timing: Timing,
+    recording: Recording,
+    helpers: Helpers,
+    ready: impl FnOnce(),
+) -> Result<(), Trouble> {
+    sys::return_large_blocks();
+    let Helpers { guardian, search } = helpers;
+    let pulse = guardian
+        .as_ref()
+        .map_or_else(|| Pulse::new(recording.clock()), |guardian| Ok(guardian.pulse()))
+        .map_err(no_room)?;
+    let processors = Processors::new(options.cpu)?;
+    // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
+    let signals = Signals::new().map_err(no_room)?;
+    let link = options.link.open(&options.access)?;
+    let notify = Notify::from_env()?;
+    info!("board {}", board.describe());
+    let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
+    shown.serve_on(link.detail());
+    let dialect = options.dialect.or_else(|| (!options.link.is_local()).then_some(DialectName::Union));
+    if options.dialect.is_none() && !options.link.is_local() {
+        info!(
+            "the host is on another computer, so its version cannot be found: it gets the union of v0.13, master and Kalico: for an older host set its dialect"
+        );
+    }
+    let place = (link.wire(), link.terminal());
+    let introduction = Introduction::start(dialect, &*board, search, place, &wake, &shown)?;
+    let (teller, asker) = status::ends();
+    let facts = Facts {
+        link: link.place(),
+        board: board.describe(),
+        pins: board.pins(),
+        view: board.view(),
+        guardian: guardian.as_ref().map(Guardian::pid),
+        requests: REQUESTS,
+        recorder: recording.status(),
+    };
+    let _status = StatusSocket::start(&options.sockets, link.terminal(), facts, shown.clone(), asker);
+    let (mut recorder, tape) = Recorder::new(recording.clone()).map_err(no_room)?;
+    let board = if options.trace_edges { recorder.with_edges(board) } else { board };
+    let trace_sockets = trace_socket_paths(&options.sockets);
+    let trace_socket = status::open_socket(&trace_sockets, link.terminal(), |errors| {
+        warn!("pinion trace --live will not be answered: {errors}");
+    });
+    let (realtime, margin) = (options.realtime, options.margin);
+    // Later threads are in real time.
+    started(pinion_linux::clock::watch_tick())?;
+    if realtime {
+        realtime::lock_memory();
+    }
+    let (clock, dialect) = (timing.clock.clone(), introduction.first_dialect());
+    let core =
+        CoreThread { board, timing, dialect, wake, pulse, teller, recording, tape, processors, margin, realtime };
+    let (core, core_end) = core.start()?;
+    started(recorder.start(trace_socket))?;
+
+    info!("{} {} ({})", link::serving(link.event().is_some()), link.place(), link.detail());
+    let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
+    let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
+    let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);
+    if realtime {
+        realtime::enter(Role::Link);
+    }
+    // This comes last of all steps that may fail. Once open, the watchdog resets the computer unless Pinion ends in
+    // order.
+    let watched = match &options.watchdog {
+        Some(path) => Watchdog::open(path).map(|watchdog| link.feed(watchdog)),
+        None => Ok(()),
+    };
+    let served = watched.and_then(|()| {
+        ready();
+        link.run().map_err(|error| refused("the link failed, so Pinion ends", error).remedy(LOOK_AT_LOG))
+    });
+    end(link, core, guardian, served)
+}
+
+/// Ends the threads and processes in order. `served` is how the link ended.
+fn end(
+    mut link: LinkThread,
+    core: JoinHandle<Left>,
+    guardian: Option<Guardian>,
+    served: Result<End, Trouble>,
+) -> Result<(), Trouble> {
+    link.stopping();
+    link.request(Request::Quit(match served {
+        Ok(End::HostOver) => Some(
+            Shutdown::because(reason::HOST_LOST, "standard input has ended")
+                .remedy("find out why the program that started Pinion closed it (ssh, socat)"),
+        ),
+        _ => None,
+    }));
+    let left = core.join();
+    link.finish();
+    let failure = match left {
+        Ok(Left::Safe) => None,
+        Ok(Left::Owing(debtor)) => Some(
+            Trouble::new(format!("{debtor} cannot be driven to its shutdown value: the guardian tries that now"))
+                .remedy("read its next line"),
+        ),
+        Err(_) => Some(Trouble::new("the core ended by a panic").remedy("please report it with the lines above")),
+    };
+    if let Some(failure) = failure {
+        let _ = served.inspect_err(|trouble| error!("{trouble}"));
+        // Without a goodbye the guardian drives the outputs.
+        return Err(failure);
+    }
+    if let Some(guardian) = guardian {
+        guardian.goodbye();
+    }
+    // After the loss of its guardian the link has already given the host time to read why.
+    if matches!(served, Ok(End::Asked)) {
+        link.farewell();
+    }
+    link.close();
+    match served? {
+        End::Asked | End::HostOver => Ok(()),
+        End::GuardianLost => {
+            Err(Trouble::new("the guardian is gone, so Pinion ends")
+                .remedy("start it anew, as the service does by itself"))
+        }
+    }
+}
+
+/// What to do if there can be no further process or thread.
+const NO_PROCESS: &str = "raise TasksMax or ulimit -u";
+
+/// The earlier of two times, if there is one.
+fn sooner(one: Option<Duration>, other: Option<Duration>) -> Option<Duration> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
+    }
+}
+
+/// That the kernel refuses something, in its words.
+fn refused(what: impl fmt::Display, error: impl fmt::Display) -> Trouble {
+    Trouble::new(error.to_string()).of(what)
+}
+
+/// That there is no memory or descriptor for a part of the program.
+fn no_room(error: io::Error) -> Trouble {
+    refused("Pinion cannot be started", error).remedy("raise LimitNOFILE, or free memory")
+}
+
+/// Adds what to do about a thread that cannot be started.
+pub fn started<T>(thread: io::Result<T>) -> Result<T, Trouble> {
+    thread.map_err(|error| refused("no thread can be started", error).remedy(NO_PROCESS))
+}

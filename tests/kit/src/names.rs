@@ -1,0 +1,7 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Names that others chose.
+
+/// Any text, often with characters that are not seen: the regular expression of a strategy of proptest.
+pub fn any_name() -> &'static str {
+    "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|[\u{202a}-\u{202e}\u{2028}\u{200b}\u{feff}\u{e0041}]|\x1b\\[31m|\n<0>){0,12}"
+}
