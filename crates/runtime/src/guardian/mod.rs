@@ -271,7 +271,7 @@ mod tests {
     fn start(script: &str, file: &Path) -> (Guarded, u32) {
         fs::write(file, "on ").unwrap();
         let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "runtime::guardian::tests::guarded_program"])
+            .args(["--ignored", "--exact", "guardian::tests::guarded_program"])
             .args(["--test-threads=1", "--nocapture"])
             .env("GUARDED_SCRIPT", script)
             .env("GUARDED_FILE", file)
