@@ -102,7 +102,7 @@ fn a_recording_is_judged_and_shown() {
     let about = format!("{}: pinion-test at /tmp/klipper_host_mcu, until 2026-11-22 14:26:14 UTC", path.display());
     assert_eq!(lines.next(), Some(about.as_str()));
     assert_eq!(lines.next(), Some(""));
-    assert!(lines.next().unwrap().contains("Zero is the end of the recording"), "{shown}");
+    assert!(lines.next().unwrap().contains("Zero is when the MCU stopped"), "{shown}");
     assert!(lines.clone().count() > 3 && lines.any(|line| line.contains("queue_step")), "{shown}");
 }
 
