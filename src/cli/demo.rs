@@ -7,7 +7,6 @@ use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 pub(super) mod heater;
-pub(super) mod picture;
 
 use crate::cli::terminal::ERASE_LINE;
 use heater::{Goal, Heater, Wiring};
@@ -15,7 +14,6 @@ use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use pinion_client::{Client, Error};
 use pinion_linux::foreign::plain;
-use pinion_protocol::clock::Clock;
 use pinion_sim::Thermistor;
 
 /// How far an axis looks for its endstop, as a multiple of its travel.
@@ -95,52 +93,6 @@ pub struct Plan {
     pub heater: Option<HeaterPlan>,
 }
 
-/// A sample of an axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct AxisSample {
-    /// Seconds since the first move of the demonstration.
-    pub t_s: f64,
-    /// Millimeters from the position at which the second approach ended.
-    pub mm: f64,
-    /// Steps per second since the previous sample, with the sign of the direction.
-    pub steps_per_s: f64,
-    /// Whether the endstop was triggered.
-    pub triggered: bool,
-}
-
-/// How an axis was homed.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct AxisReport {
-    /// The axis.
-    pub name: String,
-    /// The samples, in order.
-    pub samples: Vec<AxisSample>,
-    /// When its endstop triggered, in seconds since the first move of the demonstration.
-    pub triggers_s: Vec<f64>,
-}
-
-/// A sample of a heater.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct HeatSample {
-    /// Seconds since heating began.
-    pub t_s: f64,
-    /// Degrees Celsius.
-    pub celsius: f64,
-    /// The output, 0 to 1.
-    pub power: f64,
-}
-
-/// How a heater was heated.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct HeatReport {
-    /// The heater.
-    pub name: String,
-    /// Degrees Celsius.
-    pub target_c: f64,
-    /// The samples, in order.
-    pub samples: Vec<HeatSample>,
-}
-
 /// A check, and its result.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Check {
@@ -159,10 +111,6 @@ pub struct Report {
     pub app: String,
     /// Its version.
     pub version: String,
-    /// The axes, in the order in which they were homed.
-    pub axes: Vec<AxisReport>,
-    /// The heater, if there was one.
-    pub heater: Option<HeatReport>,
     /// All checks.
     pub checks: Vec<Check>,
 }
@@ -282,9 +230,8 @@ pub fn demonstrate(client: &mut Client, plan: &Plan, progress: &mut dyn Observer
     report.check(progress, "configured".to_owned(), true, seen);
 
     let mut queue = MoveQueue::new(status.move_count);
-    let start = client.clock_in(0.0)?;
     for axis in &axes {
-        axis.home(client, &mut queue, start, &mut report, progress)?;
+        axis.home(client, &mut queue, &mut report, progress)?;
     }
     if let Some((plan, heater)) = &mut heater {
         heat(client, plan, heater, &mut report, progress)?;
@@ -353,7 +300,6 @@ impl<'a> Axis<'a> {
         &self,
         client: &mut Client,
         queue: &mut MoveQueue,
-        start: Clock,
         report: &mut Report,
         progress: &mut dyn Observer,
     ) -> Result<(), Error> {
@@ -361,13 +307,13 @@ impl<'a> Axis<'a> {
         let what = format!("home {}", plan.name);
         self.power(client, true)?;
         let from = self.stepper.position(client)?;
-        let mut trace = AxisRecorder {
+        let mut trace = AxisProgress {
             what: &what,
             steps_per_mm: plan.steps_per_mm,
             full_mm: plan.start_mm.unwrap_or(plan.travel_mm),
             from,
             frequency_hz: client.frequency_hz(),
-            sights: Vec::new(),
+            last: None,
             progress,
         };
         let speed = plan.speed_mm_s;
@@ -379,19 +325,9 @@ impl<'a> Axis<'a> {
         let released = !self.endstop.triggered(client)?;
         let far = plan.retract_mm * 2.0;
         let second = self.approach(client, queue, far, speed * SECOND_SPEED, &mut trace)?;
-        let sights = trace.sights;
 
         let (passed, seen) = self.judge(from, first, released, second);
         report.check(progress, format!("{} homed", plan.name), passed, seen);
-
-        let frequency_hz = client.frequency_hz();
-        let at = |clock: Clock| clock.since(start) as f64 / frequency_hz;
-        let triggers = [first.trigger, second.trigger];
-        report.axes.push(AxisReport {
-            name: plan.name.clone(),
-            samples: samples(&sights, second.position, plan.steps_per_mm, at),
-            triggers_s: triggers.into_iter().flatten().map(at).collect(),
-        });
         Ok(())
     }
 
@@ -427,7 +363,7 @@ impl<'a> Axis<'a> {
         queue: &mut MoveQueue,
         far_mm: f64,
         speed_mm_s: f64,
-        trace: &mut AxisRecorder<'_>,
+        trace: &mut AxisProgress<'_>,
     ) -> Result<Homed, Error> {
         let profile = self.profile(client, far_mm, speed_mm_s)?;
         queue.home(client, self.stepper, self.endstop, self.plan.home_positive, &profile, &mut |sight| trace.saw(sight))
@@ -444,28 +380,28 @@ impl<'a> Axis<'a> {
     }
 }
 
-/// Keeps the samples of an axis while it moves, and shows them to the observer.
-struct AxisRecorder<'a> {
+/// Shows the observer an axis while it moves.
+struct AxisProgress<'a> {
     what: &'a str,
     steps_per_mm: f64,
     full_mm: f64,
     from: i64,
     frequency_hz: f64,
-    sights: Vec<Sight>,
+    last: Option<Sight>,
     progress: &'a mut dyn Observer,
 }
 
-impl AxisRecorder<'_> {
+impl AxisProgress<'_> {
     fn saw(&mut self, sight: Sight) {
         let mm = (sight.position - self.from) as f64 / self.steps_per_mm;
-        let rate = self.sights.last().map_or(0.0, |last| rate(*last, sight, self.frequency_hz));
+        let rate = self.last.map_or(0.0, |last| rate(last, sight, self.frequency_hz));
         let endstop = if sight.triggered { "closed" } else { "open" };
         self.progress.update(
             self.what,
             mm.abs() / self.full_mm,
             &format!("{mm:+8.2} mm  {:6.0} steps/s  endstop {endstop}", rate.abs()),
         );
-        self.sights.push(sight);
+        self.last = Some(sight);
     }
 }
 
@@ -475,24 +411,6 @@ fn rate(earlier: Sight, later: Sight, frequency_hz: f64) -> f64 {
         return 0.0;
     }
     (later.position - earlier.position) as f64 / ticks as f64 * frequency_hz
-}
-
-fn samples(sights: &[Sight], home: i64, steps_per_mm: f64, at: impl Fn(Clock) -> f64) -> Vec<AxisSample> {
-    let earlier = sights.first().into_iter().chain(sights);
-    sights
-        .iter()
-        .zip(earlier)
-        .map(|(sight, before)| {
-            let seconds = at(sight.clock) - at(before.clock);
-            let steps = (sight.position - before.position) as f64;
-            AxisSample {
-                t_s: at(sight.clock),
-                mm: (sight.position - home) as f64 / steps_per_mm,
-                steps_per_s: if seconds > 0.0 { steps / seconds } else { 0.0 },
-                triggered: sight.triggered,
-            }
-        })
-        .collect()
 }
 
 fn configure_heater(client: &Client, config: &mut Config, plan: &HeaterPlan) -> Result<Heater, Error> {
@@ -520,22 +438,15 @@ fn heat(
 ) -> Result<(), Error> {
     let what = format!("heat {}", plan.name);
     let goal = plan.goal;
-    let frequency_hz = client.frequency_hz();
-    let start = client.clock_in(0.0)?;
-    let mut samples: Vec<HeatSample> = Vec::new();
+    let mut first_c = None;
     let result = heater.heat(client, goal, &mut |reading| {
-        let first_c = samples.first().map_or(reading.celsius, |s| s.celsius);
+        let first_c = *first_c.get_or_insert(reading.celsius);
         let (celsius, target_c) = (reading.celsius, goal.target_c);
         progress.update(
             &what,
             (celsius - first_c) / (target_c - first_c).max(1.0),
             &format!("{celsius:6.1} °C of {target_c:.0} °C  power {:3.0} %", reading.power * 100.0),
         );
-        samples.push(HeatSample {
-            t_s: reading.clock.since(start) as f64 / frequency_hz,
-            celsius,
-            power: reading.power,
-        });
     });
     let (passed, seen) = match result {
         Ok(reading) => (
@@ -549,7 +460,6 @@ fn heat(
         Err(error) => return Err(error),
     };
     report.check(progress, format!("{} at target", plan.name), passed, seen);
-    report.heater = Some(HeatReport { name: plan.name.clone(), target_c: goal.target_c, samples });
     Ok(())
 }
 
@@ -557,6 +467,7 @@ fn heat(
 mod tests {
     use super::*;
     use crate::cli::page::tests::assert_plain;
+    use pinion_protocol::clock::Clock;
     use pinion_testkit::names::any_name;
     use proptest::prelude::*;
 
@@ -592,12 +503,9 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_s_rate_is_that_since_the_sample_before() {
+    fn the_rate_is_that_since_the_sight_before() {
         let sight = |ticks, position| Sight { clock: Clock::from_ticks(ticks), position, triggered: false };
-        let sights = [sight(0, 0), sight(1_000_000, -40), sight(1_000_000, -40)];
-        let samples = samples(&sights, -40, 80.0, |clock| clock.ticks() as f64 / 50e6);
-        let rates: Vec<_> = samples.iter().map(|s| s.steps_per_s).collect();
-        assert_eq!(rates, [0.0, -2000.0, 0.0]);
-        assert_eq!((samples[0].mm, samples[1].mm), (0.5, 0.0));
+        assert_eq!(rate(sight(0, 0), sight(1_000_000, -40), 50e6), -2000.0);
+        assert_eq!(rate(sight(1_000_000, -40), sight(1_000_000, -40), 50e6), 0.0);
     }
 }

@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::Display;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -18,8 +18,7 @@ use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use super::demo::heater::Goal;
-use super::demo::picture;
-use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
+use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
@@ -56,18 +55,15 @@ pub(super) struct SimArgs {
     demo: bool,
     /// Show the printer while a host drives it, instead of the demonstration: a live picture on a terminal,
     /// one line for each change elsewhere
-    #[arg(long, conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    #[arg(long, conflicts_with_all = ["demo", "print_config", "print_board"])]
     show: bool,
     /// Serve a picture of the printer as a webcam for Mainsail, Fluidd or a browser, on 127.0.0.1:8410 unless told
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = camera::ADDRESS,
           value_parser = camera::parse, conflicts_with_all = ["print_config", "print_board"])]
     camera: Option<String>,
-    /// Draw the homing: position, endstop and step rate over time
-    #[arg(long, value_name = "FILE.svg")]
-    picture: Option<PathBuf>,
     /// Write a line for each SPI transfer: the bus, the selected chips, the bytes in both directions. It serves a host,
     /// without the demonstration
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "print_config", "print_board"])]
     spi_trace: Option<PathBuf>,
     #[command(flatten)]
     path: PathArgs,
@@ -95,7 +91,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let Checked { path, picture, spi_trace } = match Checked::check(args) {
+    let Checked { path, spi_trace } = match Checked::check(args) {
         Ok(checked) => checked,
         Err(error) => return failed(error),
     };
@@ -158,7 +154,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
             let demo = thread::Builder::new().name("demo".into()).spawn(move || {
                 // The link's thread starts it, and passes its real-time priority on.
                 realtime::leave();
-                show(&args, &plan, &probe, picture.as_ref(), (&right, &ended));
+                show(&args, &plan, &probe, (&right, &ended));
             });
             if let Err(trouble) = pinion_runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
@@ -176,16 +172,14 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
 /// The files of the options, checked before the printer starts.
 struct Checked {
     path: Option<Files>,
-    picture: Option<Output>,
     spi_trace: Option<Output>,
 }
 
 impl Checked {
     fn check(args: &SimArgs) -> Result<Checked, String> {
         let inputs: Vec<&Path> = args.file.iter().chain(&args.path.compare).map(PathBuf::as_path).collect();
-        let output = |path: &Option<PathBuf>| path.as_deref().map(|path| Output::check(path, &inputs)).transpose();
-        let (picture, spi_trace) = (output(&args.picture)?, output(&args.spi_trace)?);
-        Ok(Checked { path: Files::check(&args.path, &inputs)?, picture, spi_trace })
+        let spi_trace = args.spi_trace.as_deref().map(|path| Output::check(path, &inputs)).transpose()?;
+        Ok(Checked { path: Files::check(&args.path, &inputs)?, spi_trace })
     }
 }
 
@@ -228,14 +222,8 @@ fn serve(
 }
 
 /// Shows the printer at work, then ends the program or says how to use it with klippy.
-fn show(
-    args: &SimArgs,
-    plan: &Plan,
-    probe: &SimProbe,
-    picture: Option<&Output>,
-    (right, ended): (&AtomicBool, &AtomicBool),
-) {
-    match demonstration(args, plan, probe, picture) {
+fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, (right, ended): (&AtomicBool, &AtomicBool)) {
+    match demonstration(args, plan, probe) {
         Err(_) if ended.load(Ordering::SeqCst) => return,
         Ok(all_right) => right.store(all_right, Ordering::SeqCst),
         Err(error) => log::error!("the demonstration: {error}"),
@@ -258,12 +246,9 @@ fn tell_how_to_connect(args: &SimArgs, end: &str) {
     tell("  klippy.py printer.cfg");
 }
 
-fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe, picture: Option<&Output>) -> Result<bool, String> {
+fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
     let mut client = Client::connect(&args.symlink, Duration::from_secs(5)).map_err(|error| error.to_string())?;
     let report = demonstrate(&mut client, plan, &mut ProgressLines::stdout()).map_err(|error| error.to_string())?;
-    if let Some(picture) = picture {
-        draw(picture, &report)?;
-    }
     // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
@@ -289,12 +274,6 @@ fn tell(line: impl Display) {
     if let Err(error) = print(&page) {
         log::warn!("{error}");
     }
-}
-
-fn draw(output: &Output, report: &Report) -> Result<(), String> {
-    output.write(|out| out.write_all(picture::homing(report).as_bytes()))?;
-    tell(format_args!("drawn: {}", output.path()));
-    Ok(())
 }
 
 /// The plan of a demonstration with this printer.

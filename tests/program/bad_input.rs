@@ -193,7 +193,6 @@ fn a_file_of_any_kind_ends_the_command_in_words() {
     for file in [&*fifo, &*directory] {
         for args in [
             &["sim", "--toolpath", file][..],
-            &["sim", "--picture", file],
             &["sim", "--spi-trace", file],
             &["dict", "--board", "sim", "-o", file],
             &["latency", "--seconds", "2", "--svg", file],

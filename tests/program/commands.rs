@@ -45,10 +45,9 @@ fn only_a_late_mcu_may_home_worse_than_allowed() {
 }
 
 #[test]
-fn the_demonstration_is_right_and_draws_its_picture() {
-    let (folder, toml) = folder_with("quick.toml", &quick_printer());
-    let svg = folder.path().join("homing.svg");
-    let args = ["sim", "-r", toml.to_str().unwrap(), "--demo", "--picture", svg.to_str().unwrap()];
+fn the_demonstration_is_right() {
+    let (_folder, toml) = folder_with("quick.toml", &quick_printer());
+    let args = ["sim", "-r", toml.to_str().unwrap(), "--demo"];
     let mut pinion = Pinion::start(&args);
     let mut status = pinion.end();
     // The MCU stops if the host itself, which has a quarter of a second, is too late.
@@ -69,7 +68,6 @@ fn the_demonstration_is_right_and_draws_its_picture() {
     for shown in ["identified", "x homed", "y homed", "z homed", "heater_bed at target", "no shutdown", verdict] {
         assert!(out.contains(shown), "no \"{shown}\" in:\n{out}");
     }
-    assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
 }
 
 #[test]
@@ -346,7 +344,6 @@ fn latency_judges_the_computer() {
         for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: "] {
             assert!(text.contains(part), "no \"{part}\" in:\n{text}");
         }
-        assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
     });
 }
 

@@ -33,11 +33,11 @@ const LATE: Ticks = Ticks::from_ms(450);
 pub(in crate::cli) struct PathArgs {
     /// At the end, write the path that the motors went: layers seen from above (.svg), the filament as a body (.stl),
     /// or moves (.gcode). It serves a host, without the demonstration
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "print_config", "print_board"])]
     toolpath: Option<PathBuf>,
     /// At the end, print how far the motors' path was from the one that this file asks for. It serves a host,
     /// without the demonstration
-    #[arg(long, value_name = "FILE.gcode", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    #[arg(long, value_name = "FILE.gcode", conflicts_with_all = ["demo", "print_config", "print_board"])]
     pub(super) compare: Option<PathBuf>,
     /// The distance along x and y above which `--compare` ends with exit status 1
     #[arg(long, value_name = "MM", requires = "compare", default_value_t = 0.1)]
