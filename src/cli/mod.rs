@@ -16,6 +16,7 @@ use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
 use pinion_runtime::klippy::process::is_pseudo_terminal;
 
+mod add;
 mod attach;
 #[cfg(test)]
 mod boards;
@@ -81,6 +82,8 @@ struct LogArgs {
 enum Command {
     /// Serve a Klipper host on a pty (the default)
     Run(run::RunArgs),
+    /// Connect a device to the header, from its wires to a first measured value
+    Add(add::AddArgs),
     /// List this computer's GPIO lines, ADCs, PWM channels and buses by name
     Pins(pins::PinsArgs),
     /// Print the data dictionary for klippy's batch mode (-d)
@@ -115,6 +118,7 @@ pub fn main() -> ExitCode {
     let status = match cli.command {
         None => run::run(&cli.run, cli.log.log_level),
         Some(Command::Run(args)) => run::run(&args, cli.log.log_level),
+        Some(Command::Add(args)) => add::run(&args),
         Some(Command::Pins(args)) => pins::run(&args),
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program from outside, over a real pty, with our own client.
 
+mod add;
 mod bad_input;
 mod camera;
 mod commands;

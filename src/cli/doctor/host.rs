@@ -20,10 +20,12 @@ use super::instance::Instance;
 use super::printer::{self, Printer};
 
 /// A klippy that runs or is set up.
-pub(super) struct Klippy {
+pub(in crate::cli) struct Klippy {
     pub(super) who: Who,
     /// The folder of klippy.py.
     folder: Option<PathBuf>,
+    /// The path of its configuration, if the command line has all of it.
+    pub(in crate::cli) config: Option<PathBuf>,
     /// Its configuration. `None` if it cannot be read.
     pub(super) printer: Option<Printer>,
     /// How it was found.
@@ -47,7 +49,7 @@ impl Klippy {
 
 /// Each klippy: the running ones that no stranger has started, and those whose units are enabled. If there is none: the
 /// installed ones.
-pub(super) fn klippys(computer: &Computer) -> Vec<Klippy> {
+pub(in crate::cli) fn klippys(computer: &Computer) -> Vec<Klippy> {
     let processes = computer.processes(Process::is_klippy);
     let mut klippys: Vec<Klippy> = processes.filter_map(|(process, unit)| running(computer, &process, unit)).collect();
     let runs: BTreeSet<String> = klippys.iter().filter_map(|klippy| klippy.unit.clone()).collect();
@@ -62,8 +64,10 @@ pub(super) fn klippys(computer: &Computer) -> Vec<Klippy> {
 fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Option<Klippy> {
     let proc = computer.path("/proc");
     let config = process.klippy_config(&proc).map(|config| computer.name(&config));
+    let named = process::klippy_config(&process.arguments).filter(|config| config.is_absolute()).map(Path::to_owned);
     Some(Klippy {
         who: computer.user_of(process.pid)?,
+        config: named,
         folder: process.klippy_folder(&proc).map(|folder| reachable(computer, folder)),
         printer: config.and_then(|config| printer::read(computer, &config)),
         found_by: format!("process {}", process.pid),
@@ -86,6 +90,7 @@ fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
     Some(Klippy {
         who,
         folder: Some(computer.path(folder)),
+        config: process::klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
         printer: process::klippy_config(&arguments).and_then(|config| printer::read(computer, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),

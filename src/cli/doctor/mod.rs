@@ -15,6 +15,7 @@ use clap::{Args, ValueHint};
 use pinion_linux::Inventory;
 use pinion_runtime::latency::{self, Fitness, Verdict};
 
+use super::add;
 use super::computer::Computer;
 use super::computer::manager::SYSTEMCTL;
 use super::finding::{self, Finding, Group};
@@ -22,13 +23,13 @@ use super::page::Page;
 use super::{failed, quietly};
 
 mod devices;
-mod host;
+pub(super) mod host;
 mod instance;
 mod kernel;
 mod klipper;
 mod last_stop;
 mod outputs;
-mod printer;
+pub(super) mod printer;
 mod serial;
 mod service;
 mod terminal;
@@ -109,6 +110,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
                 devices::leds(computer, &host::leds(&klippys)),
                 devices::line_leds(computer, &instances, &host::line_leds(&klippys)),
                 serial::ports(computer, &host::uarts(&klippys)),
+                add::missing(computer, &klippys.iter().filter_map(|klippy| klippy.config.clone()).collect()),
             ]
             .concat(),
         ),

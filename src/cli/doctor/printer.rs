@@ -64,7 +64,7 @@ fn section_of(pin: &str) -> String {
 }
 
 /// A pin's name without the MCU before it.
-pub(super) fn name_of(pin: &str) -> &str {
+pub(in crate::cli) fn name_of(pin: &str) -> &str {
     pin.rsplit(':').next().unwrap_or_default().trim_start_matches(['^', '~', '!', ' ']).trim()
 }
 
@@ -131,7 +131,7 @@ impl Reader<'_> {
 
 /// A line up to its comment. klippy itself cuts at any `#`, and gives the rest to Python's configparser. There a `;`
 /// begins a comment at the line's start or after white space.
-fn without_comment(line: &str) -> &str {
+pub(in crate::cli) fn without_comment(line: &str) -> &str {
     let line = line.split('#').next().unwrap_or_default();
     let begins = |at: &usize| line[..*at].chars().next_back().is_none_or(char::is_whitespace);
     let comment = line.match_indices(';').map(|(at, _)| at).find(begins);

@@ -1,0 +1,504 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What can be added, and to which boards: the files in `devices` and `boards`, one for each.
+//!
+//! To add one, write its file and name it in [`DEVICES`] or [`BOARDS`]. The tests check it.
+
+#![forbid(unsafe_code)]
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Deserialize;
+
+use crate::cli::computer::Computer;
+
+macro_rules! files {
+    ($folder:literal: $($name:literal)*) => {
+        [$(($name, include_str!(concat!($folder, "/", $name, ".toml")))),*]
+    };
+}
+
+/// Each device by its name on the command line, in the order of the list.
+const DEVICES: [(&str, &str); 28] = files!("devices":
+    "adxl345" "lis2dw" "lis3dh" "mpu9250" "icm20948" "bmi160"
+    "bme280" "aht" "sht" "htu21d" "lm75" "ds18b20"
+    "max6675" "max31855" "max31856" "max31865" "ads1115" "mcp3208"
+    "ws2812" "fan" "relay" "light" "button" "filament" "endstop" "hx711" "tmc2209" "ssd1306");
+
+/// Each board. The first one that fits counts.
+const BOARDS: [(&str, &str); 9] = files!("boards":
+    "raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
+    "orange-pi-3-lts" "orange-pi-zero-2" "radxa-zero-3");
+
+/// A kind of connection.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq, PartialOrd, Ord)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Kind {
+    /// SPI, with the controller's own chip select.
+    Spi,
+    /// I2C.
+    I2c,
+    /// 1-Wire.
+    W1,
+    /// The data output of an SPI controller, for LEDs.
+    Leds,
+    /// A hardware PWM channel.
+    Pwm,
+    /// A serial port.
+    Uart,
+    /// GPIO lines only.
+    Line,
+}
+
+impl Kind {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Kind::Spi => "SPI",
+            Kind::I2c => "I2C",
+            Kind::W1 => "1-Wire",
+            Kind::Leds => "SPI for LEDs",
+            Kind::Pwm => "hardware PWM",
+            Kind::Uart => "a serial port",
+            Kind::Line => "GPIO lines",
+        }
+    }
+}
+
+/// A device that can be added.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Device {
+    /// Its name on the command line, and of its file in `pinion/`.
+    #[serde(skip)]
+    pub(super) name: &'static str,
+    pub(super) title: String,
+    /// What most often goes wrong with it.
+    pub(super) trap: String,
+    /// Its section of printer.cfg.
+    pub(super) section: String,
+    /// Whether it measures resonances, and so wants a `[resonance_tester]`.
+    #[serde(default)]
+    pub(super) resonance: bool,
+    /// What to type when it works.
+    pub(super) next: Vec<String>,
+    /// The ways to connect it, the best one first.
+    pub(super) way: Vec<Way>,
+}
+
+/// A way to connect a device.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Way {
+    pub(super) bus: Kind,
+    /// SPI mode.
+    #[serde(default)]
+    pub(super) mode: u8,
+    #[serde(default)]
+    pub(super) rate_hz: u32,
+    /// The I2C addresses that the device can have, the usual one first.
+    #[serde(default)]
+    pub(super) addresses: Vec<u8>,
+    /// The name of the kernel's IIO device, if a driver of the kernel takes the chip.
+    pub(super) driver: Option<String>,
+    /// Further lines of a Raspberry Pi's config.txt. With a `driver`, all of them.
+    #[serde(default)]
+    pub(super) config_txt: Vec<String>,
+    /// The device's pins, and what each of them is connected to: `3v3`, `5v`, `gnd`, a pin of the bus, or `line`.
+    pub(super) wires: Vec<(String, String)>,
+    /// The sections of printer.cfg, with `{mcu}`, `{spi_bus}` and so on.
+    pub(super) config: String,
+    pub(super) check: Option<Check>,
+}
+
+/// How the device is asked whether it is there.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub(super) enum Check {
+    /// A register holds one of these numbers.
+    Id { register: u8, ids: Vec<u8> },
+    /// An SPI chip answers anything but all zeros or all ones.
+    Alive { register: Option<u8>, bytes: usize },
+    /// An I2C chip acknowledges and answers, with a CRC behind two bytes if it says so.
+    Answer {
+        #[serde(default)]
+        write: Vec<u8>,
+        bytes: usize,
+        #[serde(default)]
+        crc: bool,
+    },
+    /// An I2C chip answers a temperature in 1/256 degrees.
+    Temperature { write: Vec<u8>, bytes: usize },
+    /// The kernel has found a thermometer.
+    W1,
+}
+
+/// A board.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Board {
+    pub(super) name: String,
+    /// How the device tree's model begins.
+    models: Vec<String>,
+    /// A text in a file that tells it from a board with the same model.
+    marker: Option<Marker>,
+    pub(super) boot: Boot,
+    /// The files with the boot loader's settings. The first one that is there counts.
+    pub(super) files: Vec<String>,
+    /// Sections of config.txt that apply to each of the models.
+    #[serde(default)]
+    pub(super) sections: Vec<String>,
+    /// The voltage of the lines.
+    pub(super) level: String,
+    /// The labels of the header's pins, from pin 1 on.
+    pub(super) pins: Vec<String>,
+    /// The name of a connector that is no header with numbered pins.
+    pub(super) connector: Option<String>,
+    /// The lines in printer.cfg by their pin.
+    lines: BTreeMap<String, String>,
+    /// The pins for lines that nothing else needs, the best one first.
+    free: Vec<usize>,
+    /// What there is on the header.
+    pub(super) bus: BTreeMap<Kind, Bus>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Marker {
+    file: String,
+    text: String,
+}
+
+/// How a board's boot loader is told what to enable.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+pub(super) enum Boot {
+    /// A Raspberry Pi's config.txt.
+    #[serde(rename = "config.txt")]
+    ConfigTxt,
+    /// `overlays=` in armbianEnv.txt, BoardEnv.txt or orangepiEnv.txt.
+    #[serde(rename = "overlays")]
+    Overlays,
+}
+
+/// A bus of a board.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Bus {
+    /// Its name: a node in /dev, a 1-Wire bus, a PWM channel of printer.cfg, or a serial port.
+    pub(super) node: String,
+    /// Its pins.
+    pub(super) pins: BTreeMap<String, usize>,
+    /// The lines of config.txt that enable it.
+    #[serde(default)]
+    pub(super) enable: Vec<String>,
+    /// The overlays that enable it on different images, each with its parameters. The first one that the image has
+    /// counts.
+    #[serde(default)]
+    pub(super) overlays: Vec<Vec<String>>,
+    /// Another chip select of the same controller.
+    pub(super) also: Option<Spot>,
+    /// Overlays that use the same pins.
+    #[serde(default)]
+    pub(super) excludes: Vec<String>,
+}
+
+/// A place on a bus for one device.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Spot {
+    pub(super) node: String,
+    pub(super) pins: BTreeMap<String, usize>,
+}
+
+impl Bus {
+    /// Its places for devices, the best one first.
+    pub(super) fn spots(&self) -> impl Iterator<Item = Spot> {
+        [Spot { node: self.node.clone(), pins: self.pins.clone() }].into_iter().chain(self.also.clone())
+    }
+}
+
+/// A wire to make.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Wire {
+    /// The device's pin.
+    pub(super) chip: String,
+    /// Its role, as in [`Way::wires`].
+    pub(super) role: String,
+    /// The pin of the board's header, from 1 on.
+    pub(super) pin: usize,
+}
+
+/// All devices and boards.
+pub(super) struct Catalog {
+    pub(super) devices: Vec<Device>,
+    boards: Vec<Board>,
+}
+
+impl Catalog {
+    /// Reads the files.
+    ///
+    /// # Errors
+    ///
+    /// The first file with a mistake. The tests find it before a user does.
+    pub(super) fn read() -> Result<Catalog, String> {
+        fn parsed<T: for<'a> Deserialize<'a>>(name: &str, text: &str) -> Result<T, String> {
+            toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {name}.toml: {error}"))
+        }
+        let device = |(name, text): (&'static str, &str)| -> Result<Device, String> {
+            Ok(Device { name, ..parsed(name, text)? })
+        };
+        Ok(Catalog {
+            devices: DEVICES.into_iter().map(device).collect::<Result<_, _>>()?,
+            boards: BOARDS.into_iter().map(|(name, text)| parsed(name, text)).collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The device of this name.
+    pub(super) fn device(&self, name: &str) -> Option<&Device> {
+        self.devices.iter().find(|device| device.name == name)
+    }
+
+    /// The board that this computer is.
+    pub(super) fn board(&self, computer: &Computer) -> Option<&Board> {
+        let model = model(computer);
+        self.boards.iter().find(|board| {
+            let is_marked = board.marker.as_ref().is_none_or(|marker| {
+                let text = computer.text(&marker.file).unwrap_or_default();
+                text.lines().any(|line| line.split('#').next().unwrap_or_default().trim() == marker.text)
+            });
+            is_marked && board.models.iter().any(|name| model.starts_with(name.as_str()))
+        })
+    }
+
+    /// The device that has this id in this register.
+    pub(super) fn with_id(&self, register: u8, id: u8) -> Option<&Device> {
+        let has = |way: &Way| matches!(&way.check, Some(Check::Id { register: own, ids }) if *own == register && ids.contains(&id));
+        self.devices.iter().find(|device| device.way.iter().any(has))
+    }
+}
+
+/// The device tree's model.
+pub(super) fn model(computer: &Computer) -> String {
+    computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
+}
+
+impl Board {
+    /// Whether a device can be connected in this way.
+    pub(super) fn has(&self, way: &Way) -> bool {
+        let roles = way.wires.iter().filter(|(_, role)| role.starts_with("line")).count();
+        let has_bus = way.bus == Kind::Line || self.bus.contains_key(&way.bus);
+        has_bus && self.free.len() >= roles && (way.driver.is_none() || self.boot == Boot::ConfigTxt)
+    }
+
+    /// The line of a pin, as printer.cfg writes it.
+    pub(super) fn line(&self, pin: usize) -> Option<&str> {
+        self.lines.get(&pin.to_string()).map(String::as_str)
+    }
+
+    /// A place on the header for a device that is connected in this way. `uses` says whether printer.cfg uses a node for
+    /// another device.
+    ///
+    /// # Errors
+    ///
+    /// One line: another device is there.
+    pub(super) fn spot(&self, way: &Way, uses: &dyn Fn(Kind, &str) -> Option<String>) -> Result<Spot, String> {
+        let Some(bus) = self.bus.get(&way.bus) else { return Ok(Spot::default()) };
+        let controller = |node: &str| node.split('.').next().unwrap_or_default().to_owned();
+        let is_shared = way.bus == Kind::I2c || way.bus == Kind::W1;
+        // LEDs and an HX711 take every transfer on the data output for theirs.
+        let is_alone = way.bus == Kind::Leds || way.bus == Kind::Spi && !way.wires.iter().any(|(_, role)| role == "cs");
+        let mut refusal = String::new();
+        for spot in bus.spots() {
+            let others = self.bus.iter().flat_map(|(kind, other)| other.spots().map(move |other| (*kind, other)));
+            let mut others = others.filter(|(kind, _)| *kind != way.bus || !is_shared);
+            let conflict = others.find_map(|(kind, other)| {
+                let section = uses(kind, &other.node)?;
+                let wants_all = is_alone || ["neopixel", "load_cell"].iter().any(|name| section.starts_with(name));
+                let is_same = controller(&other.node) == controller(&spot.node);
+                let crosses = other.pins.values().any(|pin| spot.pins.values().any(|own| own == pin));
+                let conflicts = other.node == spot.node || if is_same { wants_all } else { crosses };
+                conflicts.then(|| format!("[{section}] in printer.cfg uses {}, whose pins it would need", other.node))
+            });
+            match conflict {
+                None => return Ok(spot),
+                Some(conflict) => refusal = conflict,
+            }
+        }
+        Err(format!("{refusal}: pins.md says how chips share a bus (docs/guide/pins.md)"))
+    }
+
+    /// The wires to make. `taken` are lines that are in use. `wanted` is the pin that the user has chosen for the first
+    /// line.
+    ///
+    /// # Errors
+    ///
+    /// One line: no line is free, or the chosen pin is none for a line.
+    pub(super) fn wires(
+        &self,
+        way: &Way,
+        spot: &Spot,
+        taken: &BTreeSet<String>,
+        wanted: Option<usize>,
+    ) -> Result<Vec<Wire>, String> {
+        let own: BTreeSet<usize> = spot.pins.values().copied().collect();
+        let is_free = |pin: &usize| !own.contains(pin) && self.line(*pin).is_some_and(|line| !taken.contains(line));
+        let mut free = self.free.iter().copied().filter(is_free).filter(|pin| Some(*pin) != wanted);
+        let mut wires = Vec::new();
+        for (chip, role) in &way.wires {
+            let labeled = |label: &str| self.pins.iter().position(|pin| pin == label).map(|at| at + 1);
+            let pin = match role.as_str() {
+                "3v3" => labeled("3.3 V"),
+                "5v" => labeled("5 V"),
+                "gnd" => labeled("GND"),
+                "line" if wanted.is_some() => {
+                    let usable = wanted.filter(is_free);
+                    Some(usable.ok_or_else(|| {
+                        let pins: Vec<String> =
+                            self.free.iter().filter(|pin| is_free(pin)).map(usize::to_string).collect();
+                        format!("--pin: this pin has no free line: choose one of {}", pins.join(", "))
+                    })?)
+                }
+                role if role.starts_with("line") => free.next(),
+                role => spot.pins.get(role).copied(),
+            };
+            let pin = pin.ok_or_else(|| format!("{} has no free pin for {chip}: see pinion pins --free", self.name))?;
+            wires.push(Wire { chip: chip.clone(), role: role.clone(), pin });
+        }
+        Ok(wires)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::computer::tests::Tree;
+    use std::fs;
+    use std::path::Path;
+
+    #[test]
+    fn each_file_is_in_the_catalog_and_the_catalog_can_be_read() {
+        let names = |folder: &str| -> BTreeSet<String> {
+            let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/cli/add").join(folder);
+            let files = fs::read_dir(folder).unwrap().map(|file| file.unwrap().path());
+            files.map(|file| file.file_stem().unwrap().to_str().unwrap().to_owned()).collect()
+        };
+        assert_eq!(names("devices"), DEVICES.iter().map(|(name, _)| (*name).to_owned()).collect());
+        assert_eq!(names("boards"), BOARDS.iter().map(|(name, _)| (*name).to_owned()).collect());
+        Catalog::read().unwrap();
+    }
+
+    /// What a mistake in a file would be.
+    #[test]
+    fn the_data_fit_together() {
+        let catalog = Catalog::read().unwrap();
+        for board in &catalog.boards {
+            for (kind, bus) in &board.bus {
+                assert_ne!(bus.enable.is_empty(), bus.overlays.is_empty(), "{} {kind:?}", board.name);
+                assert_eq!(board.boot == Boot::ConfigTxt, bus.overlays.is_empty(), "{} {kind:?}", board.name);
+                for pin in bus.pins.values() {
+                    assert!((1..=board.pins.len()).contains(pin), "{} {kind:?} {pin}", board.name);
+                    assert!(!["GND", "5 V", "3.3 V", "-"].contains(&board.pins[pin - 1].as_str()), "{}", board.name);
+                }
+            }
+            for pin in &board.free {
+                assert!(board.line(*pin).is_some(), "{}: pin {pin}", board.name);
+            }
+            for pin in board.lines.keys() {
+                let label = &board.pins[pin.parse::<usize>().unwrap() - 1];
+                assert!(label.starts_with("GPIO") || label.starts_with('P'), "{}: {label}", board.name);
+            }
+        }
+        for device in &catalog.devices {
+            let first = device.way[0].config.trim_start().lines().next().unwrap();
+            assert!(first.starts_with('['), "{}", device.name);
+            for way in &device.way {
+                let section = format!("[{}]", device.section);
+                assert!(way.config.lines().any(|line| line == section), "{}: no {section}", device.name);
+                assert!(device.trap.len() < 140 && !device.next.is_empty(), "{}", device.name);
+                assert_eq!(way.bus == Kind::I2c, !way.addresses.is_empty(), "{}", device.name);
+                assert!(way.bus != Kind::Spi || way.check.is_none() || way.rate_hz >= 100_000, "{}", device.name);
+                // Every device can be added to a Raspberry Pi 4.
+                let wires = catalog.boards[1]
+                    .wires(way, &catalog.boards[1].spot(way, &|_, _| None).unwrap(), &BTreeSet::new(), None)
+                    .unwrap();
+                let mut signals: Vec<usize> = wires.iter().map(|wire| wire.pin).collect();
+                signals.sort_unstable();
+                signals.dedup();
+                assert_eq!(signals.len(), wires.len(), "{}: two wires on one pin", device.name);
+            }
+        }
+    }
+
+    #[test]
+    fn a_board_is_known_by_its_model() {
+        let catalog = Catalog::read().unwrap();
+        let name = |model: &str, system_cfg: &str| {
+            let tree = Tree::new();
+            tree.put("proc/device-tree/model", &format!("{model}\0"));
+            tree.put("boot/system.cfg", system_cfg);
+            catalog.board(&tree.computer()).map(|board| board.name.clone()).unwrap_or_default()
+        };
+        for (model, board) in [
+            ("Raspberry Pi 2 Model B Rev 1.1", "Raspberry Pi 2, 3 or Zero 2"),
+            ("Raspberry Pi 3 Model B Plus Rev 1.3", "Raspberry Pi 2, 3 or Zero 2"),
+            ("Raspberry Pi Zero 2 W Rev 1.0", "Raspberry Pi 2, 3 or Zero 2"),
+            ("Raspberry Pi 400 Rev 1.0", "Raspberry Pi 4"),
+            ("Raspberry Pi 5 Model B Rev 1.0", "Raspberry Pi 5"),
+            ("BigTreeTech CB1", "BigTreeTech CB1 on a board with 40 pins"),
+            ("BigTreeTech CB2", "BigTreeTech CB2 or Pi 2"),
+            ("OrangePi Zero3", "Orange Pi Zero 2 or 3"),
+            ("OrangePi 3 LTS", "Orange Pi 3 LTS"),
+            ("Radxa ZERO 3W", "Radxa ZERO 3"),
+            ("Pine64", ""),
+            ("", ""),
+            ("x\u{1b}[2J\nRaspberry Pi 4", ""),
+        ] {
+            assert_eq!(name(model, ""), board);
+        }
+        assert_eq!(name("BigTreeTech CB1", "BTT_PAD7=\"ON\"  # enables\n"), "BigTreeTech Pad 7 with a CB1");
+        assert!(name("BigTreeTech CB1", "#BTT_PAD7=\"ON\"\n").contains("40 pins"));
+    }
+
+    #[test]
+    fn two_devices_are_not_put_on_the_same_pins() {
+        let catalog = Catalog::read().unwrap();
+        let board = &catalog.boards[1];
+        let spot = |device: &str, used: &[&str]| {
+            let used: Vec<String> = used.iter().map(|node| (*node).to_owned()).collect();
+            let uses = move |_: Kind, node: &str| used.contains(&node.to_owned()).then(|| "x".to_owned());
+            board.spot(&catalog.device(device).unwrap().way[0], &uses).map(|spot| spot.node)
+        };
+        assert_eq!(spot("adxl345", &[]).unwrap(), "spidev0.0");
+        assert_eq!(spot("adxl345", &["spidev0.0"]).unwrap(), "spidev0.1");
+        assert!(
+            spot("adxl345", &["spidev0.0", "spidev0.1"]).unwrap_err().starts_with("[x] in printer.cfg uses spidev0.")
+        );
+        let uses_leds = |_: Kind, node: &str| (node == "spidev0.0").then(|| "neopixel a".to_owned());
+        assert!(board.spot(&catalog.device("adxl345").unwrap().way[0], &uses_leds).is_err());
+        for alone in ["ws2812", "hx711"] {
+            assert!(spot(alone, &["spidev0.1"]).is_err(), "{alone}");
+        }
+        assert_eq!(spot("bme280", &["i2c-1"]).unwrap(), "i2c-1");
+        assert!(spot("tmc2209", &["w1_bus_master1"]).unwrap_err().contains("w1_bus_master1"), "both have pin 7");
+        assert!(spot("ds18b20", &["ttyAMA3"]).is_err());
+        assert_eq!(spot("relay", &["spidev0.0"]).unwrap(), "");
+    }
+
+    #[test]
+    fn a_line_is_one_that_nothing_uses() {
+        let catalog = Catalog::read().unwrap();
+        let (board, way) = (&catalog.boards[1], &catalog.device("relay").unwrap().way[0]);
+        let line = |taken: &[&str], wanted| {
+            let taken = taken.iter().map(|line| (*line).to_owned()).collect();
+            board.wires(way, &Spot::default(), &taken, wanted).map(|wires| wires.last().unwrap().pin)
+        };
+        assert_eq!(line(&[], None), Ok(11));
+        assert_eq!(line(&["GPIO17", "GPIO27"], None), Ok(15));
+        assert_eq!(line(&[], Some(40)), Ok(40));
+        assert_eq!(line(&[], Some(29)), Ok(29), "it is not among the proposed ones, and it is a line");
+        for wrong in [0, 1, 6, 41, usize::MAX] {
+            assert!(line(&[], Some(wrong)).unwrap_err().starts_with("--pin: "), "{wrong}");
+        }
+        assert!(line(&["GPIO21"], Some(40)).is_err());
+        assert_eq!(catalog.with_id(0x0f, 0x33).unwrap().name, "lis3dh");
+        assert!(catalog.with_id(0x0f, 0xe5).is_none());
+    }
+}

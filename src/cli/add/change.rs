@@ -1,0 +1,500 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Changes of files: planned, shown, made, recorded and taken back.
+//!
+//! A file is replaced as a whole, by a rename: whoever kills the program leaves the old file or the new one. Files are
+//! reached below the descriptor of their folder ([`OwnFolder`]), never through a link in their place. What is printer.cfg's
+//! owner's is written with the rights of that user, so no file of anybody else can be behind it.
+//!
+//! A change is a splice: the text that it has replaced, and the new text. So it can be taken back after others have
+//! changed the file elsewhere. The record of all splices of a device is written before the first of them is made.
+
+#![forbid(unsafe_code)]
+
+use std::fs::{self, File, Permissions};
+use std::io::{self, Write};
+use std::os::unix::fs::{MetadataExt, PermissionsExt, fchown};
+use std::path::{Path, PathBuf};
+
+use nix::unistd::{Gid, Uid, getegid, geteuid, getgroups, setegid, seteuid, setgroups};
+use serde::{Deserialize, Serialize};
+
+use crate::cli::computer::Computer;
+use pinion_linux::foreign;
+use pinion_linux::own_folder::OwnFolder;
+
+/// Longest file that is changed. A printer.cfg has some 100 kB at most.
+const BYTES_MAX: u64 = 4 << 20;
+
+/// A text that replaces another one at a place of a file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Splice {
+    /// The first byte.
+    pub(super) at: usize,
+    pub(super) old: String,
+    pub(super) new: String,
+}
+
+impl Splice {
+    /// Makes the change in the text that it was planned for.
+    pub(super) fn apply(&self, text: &mut String) {
+        text.replace_range(self.at..self.at + self.old.len(), &self.new);
+    }
+
+    /// Takes the change back, also if the text has changed elsewhere. False if it is not in the text.
+    ///
+    /// # Errors
+    ///
+    /// The new text is there several times, and which one is ours cannot be known.
+    pub(super) fn revert(&self, text: &mut String) -> Result<bool, String> {
+        let is_whole_line = |at: usize| at == 0 || self.new.starts_with(['\r', '\n']) || text[..at].ends_with('\n');
+        let at = if text.get(self.at..).is_some_and(|rest| rest.starts_with(&self.new)) {
+            self.at
+        } else {
+            let mut found = text.match_indices(&self.new).map(|(at, _)| at).filter(|at| is_whole_line(*at));
+            match (found.next(), found.next()) {
+                (None, _) => return Ok(false),
+                (Some(at), None) => at,
+                _ => return Err(format!("\"{}\" is there several times: remove the right one", self.new.trim())),
+            }
+        };
+        text.replace_range(at..at + self.new.len(), &self.old);
+        Ok(true)
+    }
+}
+
+/// A change of one file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Change {
+    /// What it is for. Several devices may need the same.
+    pub(super) key: String,
+    /// The file, as a path of the computer.
+    pub(super) file: PathBuf,
+    /// Whether the file is made.
+    pub(super) makes: bool,
+    pub(super) splice: Splice,
+}
+
+/// What a device has changed, and what it needs of others' changes.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Record {
+    pub(super) changes: Vec<Change>,
+    /// The keys of all that it needs, whoever has made it.
+    pub(super) needs: Vec<String>,
+}
+
+impl Record {
+    /// Adds the changes of a later call. One of the same key replaces that of an earlier call, which was not made.
+    pub(super) fn extend(&mut self, later: Record) {
+        self.changes
+            .retain(|change| !later.changes.iter().any(|new| (&new.key, &new.file) == (&change.key, &change.file)));
+        self.changes.extend(later.changes);
+        self.needs.extend(later.needs);
+        self.needs.sort();
+        self.needs.dedup();
+    }
+}
+
+/// The rights of a file's owner, for as long as this exists. Without root's rights it changes nothing.
+struct Rights(Option<(Uid, Gid, Vec<Gid>)>);
+
+impl Rights {
+    fn of(owner: Option<(u32, u32)>) -> io::Result<Rights> {
+        let Some((uid, gid)) = owner.filter(|(uid, _)| *uid != 0 && geteuid().is_root()) else {
+            return Ok(Rights(None));
+        };
+        let rights = Rights(Some((geteuid(), getegid(), getgroups()?)));
+        setgroups(&[Gid::from_raw(gid)])?;
+        setegid(Gid::from_raw(gid))?;
+        seteuid(Uid::from_raw(uid))?;
+        Ok(rights)
+    }
+}
+
+impl Drop for Rights {
+    fn drop(&mut self) {
+        let Some((uid, gid, groups)) = self.0.take() else { return };
+        let back = seteuid(uid).and_then(|()| setegid(gid)).and_then(|()| setgroups(&groups));
+        if let Err(error) = back {
+            // Nothing after this may run with a mixture of rights.
+            let _ = crate::cli::failed(format!("root's rights cannot be taken again: {error}: call this again"));
+            crate::cli::logging::finish();
+            std::process::exit(1);
+        }
+    }
+}
+
+/// A side of the computer where files are changed: root's, or that of printer.cfg's owner.
+pub(super) struct Side<'a> {
+    pub(super) computer: &'a Computer,
+    /// User and group whose files these are. `None`: the caller's.
+    pub(super) owner: Option<(u32, u32)>,
+    /// The folder with the records.
+    pub(super) records: PathBuf,
+}
+
+impl Side<'_> {
+    /// The bytes of a file. `None` if there is none.
+    ///
+    /// # Errors
+    ///
+    /// One line: a link or another kind of file is in its place, it is no text, or it cannot be read.
+    pub(super) fn read(&self, file: &Path) -> Result<Option<String>, String> {
+        let _rights = Rights::of(self.owner).map_err(|error| told(file, &error))?;
+        match self.folder(file, false) {
+            Ok((folder, name)) => read_in(&folder, &name).map_err(|error| told(file, &error)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(told(file, &error)),
+        }
+    }
+
+    fn folder(&self, file: &Path, makes: bool) -> io::Result<(OwnFolder, String)> {
+        let name = file.file_name().and_then(|name| name.to_str());
+        let name = name.ok_or_else(|| io::Error::other("its name is not usable"))?;
+        let folder = self.computer.path(file.parent().unwrap_or(Path::new("/")));
+        let folder = if makes { OwnFolder::make(&folder)? } else { OwnFolder::open(&folder)? };
+        Ok((folder, name.to_owned()))
+    }
+
+    /// Puts a text in a file's place. Its owner and mode stay.
+    fn write(&self, file: &Path, text: &str) -> Result<(), String> {
+        let write = || {
+            let _rights = Rights::of(self.owner)?;
+            let (folder, name) = self.folder(file, true)?;
+            replace(&folder, &name, text.as_bytes())
+        };
+        write().map_err(|error: io::Error| told(file, &error))
+    }
+
+    fn remove(&self, file: &Path) -> Result<(), String> {
+        let remove = || {
+            let _rights = Rights::of(self.owner)?;
+            let (folder, name) = self.folder(file, false)?;
+            fs::remove_file(folder.at(name))
+        };
+        remove().map_err(|error: io::Error| told(file, &error))
+    }
+
+    /// Removes a folder that has become empty.
+    fn tidy(&self, folder: &Path) {
+        if let Ok(_rights) = Rights::of(self.owner)
+            && let Ok((parent, name)) = self.folder(folder, false)
+        {
+            // It may hold other files, or be gone.
+            let _ = fs::remove_dir(parent.at(name));
+        }
+    }
+
+    fn record_of(&self, device: &str) -> PathBuf {
+        self.records.join(format!(".add-{device}.json"))
+    }
+
+    /// What was recorded of a device.
+    ///
+    /// # Errors
+    ///
+    /// One line: the record cannot be read.
+    pub(super) fn record(&self, device: &str) -> Result<Option<Record>, String> {
+        let file = self.record_of(device);
+        let Some(text) = self.read(&file)? else { return Ok(None) };
+        serde_json::from_str(&text)
+            .map(Some)
+            .map_err(|error| format!("{}: it is no record of pinion add: {error}: remove it", file.display()))
+    }
+
+    /// Makes the changes, and records them first. Each file that is changed is copied before, byte for byte.
+    ///
+    /// # Errors
+    ///
+    /// One line with the file and the cause. What was made until then is recorded.
+    pub(super) fn make(&self, device: &str, new: &Record) -> Result<(), String> {
+        let old = self.record(device)?;
+        let mut record = old.clone().unwrap_or_default();
+        record.extend(new.clone());
+        if old.as_ref() != Some(&record) {
+            let text = serde_json::to_string_pretty(&record).map_err(|error| error.to_string())?;
+            self.write(&self.record_of(device), &(text + "\n"))?;
+        }
+        for file in files(&new.changes) {
+            let own = new.changes.iter().filter(|change| change.file == file);
+            let mut text = self.read(&file)?.unwrap_or_default();
+            let before = text.clone();
+            for Change { splice, .. } in own.clone() {
+                if !text.get(splice.at..).is_some_and(|rest| rest.starts_with(&splice.old)) {
+                    return Err(format!("{} has changed meanwhile: call pinion add again", file.display()));
+                }
+                splice.apply(&mut text);
+            }
+            let copy = copy_of(&file, device);
+            if own.clone().all(|change| !change.makes) && self.read(&copy)?.is_none() {
+                self.write(&copy, &before)?;
+            }
+            self.write(&file, &text)?;
+        }
+        Ok(())
+    }
+
+    /// Takes a device's changes back. A change that another one of `devices` needs becomes that device's. Returns a
+    /// line for each thing that was left.
+    ///
+    /// # Errors
+    ///
+    /// One line with the file and the cause. What is left can be taken back by another call.
+    pub(super) fn undo(&self, device: &str, devices: &[&str]) -> Result<Vec<String>, String> {
+        let mut left = Vec::new();
+        let Some(record) = self.record(device)? else { return Ok(left) };
+        let mut kept = Vec::new();
+        for other in devices.iter().filter(|other| **other != device) {
+            let Some(mut heir) = self.record(other)? else { continue };
+            let inherited =
+                record.changes.iter().filter(|change| heir.needs.contains(&change.key) && !kept.contains(*change));
+            let inherited: Vec<Change> = inherited.cloned().collect();
+            if !inherited.is_empty() {
+                kept.extend(inherited.iter().cloned());
+                heir.extend(Record { changes: inherited, needs: Vec::new() });
+                let text = serde_json::to_string_pretty(&heir).map_err(|error| error.to_string())?;
+                self.write(&self.record_of(other), &(text + "\n"))?;
+            }
+        }
+        for file in files(&record.changes) {
+            let own: Vec<&Change> = record.changes.iter().filter(|change| change.file == file).collect();
+            let own: Vec<&Change> = own.into_iter().filter(|change| !kept.contains(*change)).collect();
+            let before = left.len();
+            self.undo_file(&file, &own, &mut left)?;
+            self.drop_copy(&file, device, left.len() == before, &mut left)?;
+        }
+        self.remove(&self.record_of(device))?;
+        self.tidy(&self.records);
+        Ok(left)
+    }
+
+    fn undo_file(&self, file: &Path, own: &[&Change], left: &mut Vec<String>) -> Result<(), String> {
+        let shown = file.display();
+        let Some(text) = self.read(file)? else { return Ok(()) };
+        if let Some(made) = own.iter().find(|change| change.makes) {
+            if text == made.splice.new {
+                return self.remove(file);
+            }
+            left.push(format!("{shown} was changed since: remove it if you do not need it"));
+            return Ok(());
+        }
+        let mut reverted = text.clone();
+        for change in own.iter().rev() {
+            if let Err(why) = change.splice.revert(&mut reverted) {
+                left.push(format!("{shown}: {why}"));
+            }
+        }
+        if reverted != text {
+            self.write(file, &reverted)?;
+        }
+        Ok(())
+    }
+
+    /// Removes a device's copy of a file, if what the device has changed there was found and taken back.
+    fn drop_copy(&self, file: &Path, device: &str, is_clean: bool, left: &mut Vec<String>) -> Result<(), String> {
+        let copy = copy_of(file, device);
+        if self.read(&copy)?.is_none() {
+            return Ok(());
+        }
+        if is_clean {
+            return self.remove(&copy);
+        }
+        left.push(format!("{} is {} as it was before", copy.display(), file.display()));
+        Ok(())
+    }
+}
+
+/// The files of changes, each once, in order.
+fn files(changes: &[Change]) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = Vec::new();
+    for change in changes {
+        if !files.contains(&change.file) {
+            files.push(change.file.clone());
+        }
+    }
+    files
+}
+
+/// Where a file is copied to before it is changed.
+pub(super) fn copy_of(file: &Path, device: &str) -> PathBuf {
+    let mut name = file.as_os_str().to_owned();
+    name.push(format!(".before-add-{device}"));
+    name.into()
+}
+
+fn read_in(folder: &OwnFolder, name: &str) -> io::Result<Option<String>> {
+    let path = folder.at(name);
+    match fs::symlink_metadata(&path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error),
+        Ok(about) if about.is_symlink() => {
+            return Err(io::Error::other("it is a link: name the file that it leads to"));
+        }
+        Ok(about) if about.len() > BYTES_MAX => return Err(io::ErrorKind::FileTooLarge.into()),
+        Ok(_) => {}
+    }
+    let bytes = foreign::read(&path, BYTES_MAX)?;
+    String::from_utf8(bytes).map(Some).map_err(|_| io::Error::other("it is not UTF-8: convert it first"))
+}
+
+/// Writes a file beside its place, then over it.
+fn replace(folder: &OwnFolder, name: &str, bytes: &[u8]) -> io::Result<()> {
+    let there = match fs::symlink_metadata(folder.at(name)) {
+        Ok(about) if !about.is_file() => return Err(io::Error::other("it is no regular file")),
+        Ok(about) => Some(about),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+        Err(error) => return Err(error),
+    };
+    let fresh = format!(".{name}.pinion-add");
+    let put = || -> io::Result<()> {
+        let mut file = folder.create(&fresh)?;
+        file.write_all(bytes)?;
+        // A FAT file system has neither owners nor modes to set.
+        let mode = there.as_ref().map_or(0o644, |about| about.mode() & 0o777);
+        let _ = file.set_permissions(Permissions::from_mode(mode));
+        if let Some(about) = &there {
+            let _ = fchown(&file, Some(about.uid()), Some(about.gid()));
+        }
+        file.sync_all()?;
+        fs::rename(folder.at(&fresh), folder.at(name))?;
+        File::open(folder.at("."))?.sync_all()
+    };
+    put().inspect_err(|_| drop(fs::remove_file(folder.at(&fresh))))
+}
+
+fn told(file: &Path, error: &io::Error) -> String {
+    let remedy = match error.kind() {
+        io::ErrorKind::PermissionDenied => ": call it with sudo",
+        io::ErrorKind::StorageFull => ": make room, then call it again",
+        _ => "",
+    };
+    format!("{}: {error}{remedy}", file.display())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::computer::tests::Tree;
+    use proptest::prelude::*;
+    use std::os::unix::fs::symlink;
+
+    fn change(key: &str, file: &str, makes: bool, at: usize, old: &str, new: &str) -> Change {
+        Change { key: key.into(), file: file.into(), makes, splice: Splice { at, old: old.into(), new: new.into() } }
+    }
+
+    /// All files below a folder with their bytes and modes.
+    fn snapshot(root: &Path) -> Vec<(PathBuf, Vec<u8>, u32)> {
+        let mut found = Vec::new();
+        let mut folders = vec![root.to_owned()];
+        while let Some(folder) = folders.pop() {
+            for entry in fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                let about = fs::symlink_metadata(&path).unwrap();
+                if about.is_dir() {
+                    folders.push(path);
+                } else {
+                    found.push((path.clone(), fs::read(&path).unwrap_or_default(), about.mode()));
+                }
+            }
+        }
+        found.sort();
+        found
+    }
+
+    fn side<'a>(computer: &'a Computer) -> Side<'a> {
+        Side { computer, owner: None, records: "/home/pinion".into() }
+    }
+
+    #[test]
+    fn a_change_that_another_device_needs_stays_until_nobody_does() {
+        let tree = Tree::new();
+        tree.put_mode("home/printer.cfg", "[mcu]\n", 0o640);
+        let before = snapshot(&tree.computer().path("/"));
+        let computer = tree.computer();
+        let side = side(&computer);
+        let shared = change("include", "/home/printer.cfg", false, 0, "", "[include pinion/*.cfg]\n");
+        let own = |name: &str| change(name, &format!("/home/pinion/{name}.cfg"), true, 0, "", name);
+        let needs = || vec!["include".to_owned()];
+        side.make("a", &Record { changes: vec![own("a"), shared.clone()], needs: needs() }).unwrap();
+        side.make("b", &Record { changes: vec![own("b")], needs: needs() }).unwrap();
+        assert_eq!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap(), "[include pinion/*.cfg]\n[mcu]\n");
+        let all = ["a", "b", "c"];
+        side.undo("a", &all).unwrap();
+        assert!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap().starts_with("[include"), "b needs it");
+        assert!(side.read(Path::new("/home/pinion/a.cfg")).unwrap().is_none());
+        side.undo("b", &all).unwrap();
+        assert_eq!(snapshot(&computer.path("/")), before);
+        assert!(!computer.path("/home/pinion").exists());
+        assert_eq!(side.undo("b", &all), Ok(vec![]), "a second time does nothing");
+    }
+
+    #[test]
+    fn what_the_user_has_changed_meanwhile_stays() {
+        let tree = Tree::new();
+        tree.put("home/printer.cfg", "[mcu]\n");
+        let computer = tree.computer();
+        let side = side(&computer);
+        let record = Record {
+            changes: vec![
+                change("a", "/home/pinion/a.cfg", true, 0, "", "[a]\n"),
+                change("i", "/home/printer.cfg", false, 0, "", "[i]\n"),
+            ],
+            needs: vec![],
+        };
+        side.make("a", &record).unwrap();
+        tree.put("home/printer.cfg", "# mine\n[i]\n[mcu]\n#*# saved\n");
+        tree.put("home/pinion/a.cfg", "[a]\nmine: 1\n");
+        let left = side.undo("a", &["a"]).unwrap();
+        assert_eq!(left.len(), 1, "{left:?}");
+        assert!(left[0].starts_with("/home/pinion/a.cfg was changed since"), "{left:?}");
+        assert!(!computer.path("/home/printer.cfg.before-add-a").exists());
+        assert_eq!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap(), "# mine\n[mcu]\n#*# saved\n");
+        let splice = Splice { at: 9, old: String::new(), new: "x=1\n".into() };
+        assert!(splice.revert(&mut "x=1\nx=1\n".into()).unwrap_err().contains("several times"));
+        assert_eq!(splice.revert(&mut "yx=1\n".into()), Ok(false), "it is part of another line");
+    }
+
+    #[test]
+    fn nothing_is_read_or_written_through_a_link() {
+        let tree = Tree::new();
+        tree.put("etc/shadow", "secret\n");
+        tree.put("home/real.cfg", "x\n");
+        tree.link("home/printer.cfg", "../etc/shadow");
+        let computer = tree.computer();
+        let side = side(&computer);
+        let file = Path::new("/home/printer.cfg");
+        assert!(side.read(file).unwrap_err().contains("it is a link: name the file"));
+        assert!(side.write(file, "y").unwrap_err().contains("no regular file"));
+        // A link in the place of the new file, or of the copy.
+        symlink("../etc/shadow", computer.path("/home/.real.cfg.pinion-add")).unwrap();
+        side.write(Path::new("/home/real.cfg"), "new\n").unwrap();
+        symlink("../etc/shadow", computer.path("/home/real.cfg.before-add-a")).unwrap();
+        let record = Record { changes: vec![change("k", "/home/real.cfg", false, 0, "new", "newer")], needs: vec![] };
+        assert!(side.make("a", &record).unwrap_err().contains("it is a link"));
+        assert_eq!(fs::read(computer.path("/etc/shadow")).unwrap(), b"secret\n");
+        assert_eq!(fs::read(computer.path("/home/real.cfg")).unwrap(), b"new\n");
+        // A pipe and a folder.
+        nix::unistd::mkfifo(&computer.path("/home/pipe"), nix::sys::stat::Mode::S_IRWXU).unwrap();
+        assert!(side.read(Path::new("/home/pipe")).is_err() && side.read(Path::new("/home")).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_is_made_can_be_taken_back(
+            text in "(\\PC|\n|\r\n){0,40}", new in "[a-z]{1,5}\n", at in 0usize..40, files in 1usize..3
+        ) {
+            let tree = Tree::new();
+            let names: Vec<String> = (0..files).map(|number| format!("home/file{number}")).collect();
+            names.iter().for_each(|name| tree.put(name, &text));
+            let before = snapshot(&tree.computer().path("/"));
+            let at = (0..=at.min(text.len())).rev().find(|at| text.is_char_boundary(*at)).unwrap_or(0);
+            let changes = names.iter().map(|name| change("k", &format!("/{name}"), false, at, "", &new));
+            let made = change("m", "/home/pinion/made", true, 0, "", &new);
+            let record = Record { changes: changes.chain([made]).collect(), needs: vec![] };
+            let computer = tree.computer();
+            let side = side(&computer);
+            side.make("a", &record).unwrap();
+            prop_assert_eq!(side.undo("a", &["a"]).unwrap(), Vec::<String>::new());
+            prop_assert_eq!(snapshot(&computer.path("/")), before);
+        }
+    }
+}

@@ -1,0 +1,429 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! printer.cfg: what is in it, and what a device adds.
+//!
+//! A device has a file of its own in the folder `pinion` beside printer.cfg, and all of them share one
+//! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched.
+
+#![forbid(unsafe_code)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use glob::Pattern;
+
+use crate::cli::computer::Computer;
+use crate::cli::doctor::host::klippys;
+use crate::cli::doctor::printer::{name_of, without_comment};
+use pinion_runtime::klippy::is_host_path;
+
+use super::catalog::{Device, Kind};
+use super::change::{Change, Side, Splice};
+
+/// Highest number of files in a configuration. No configuration has as many.
+const FILES_MAX: usize = 500;
+/// Where klippy's configuration is if no klippy runs or is set up.
+const USUAL: [&str; 3] =
+    ["/home/*/printer_data/config/printer.cfg", "/home/*/klipper_config/printer.cfg", "/home/*/printer.cfg"];
+/// The usual link to this computer's MCU.
+const LINK: &str = "/tmp/klipper_host_mcu";
+/// The key of the change that includes the folder.
+const INCLUDE: &str = "include";
+/// The key of the change that adds the MCU.
+const MCU: &str = "mcu";
+/// How high above the bed resonances are measured, in millimeters (docs/Measuring_Resonances.md of Klipper).
+const PROBE_Z_MM: f64 = 20.0;
+
+/// A section of the configuration.
+#[derive(Debug, Default)]
+struct Section {
+    /// The files that it is in.
+    files: BTreeSet<PathBuf>,
+    values: BTreeMap<String, String>,
+}
+
+/// klippy's configuration.
+#[derive(Debug)]
+pub(super) struct Printer {
+    /// printer.cfg, as a path of the computer.
+    pub(super) path: PathBuf,
+    /// Its owner and group.
+    pub(super) owner: (u32, u32),
+    /// What printer.cfg itself holds.
+    text: String,
+    sections: BTreeMap<String, Section>,
+    /// The patterns of all includes in printer.cfg itself, as absolute paths.
+    includes: Vec<PathBuf>,
+}
+
+/// Finds printer.cfg: the one that is named, that of the only klippy, or the only one in a home folder.
+///
+/// # Errors
+///
+/// One line: there is none, or there are several.
+pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf, String> {
+    if let Some(named) = named {
+        return Ok(named.to_owned());
+    }
+    let of_klippys: BTreeSet<PathBuf> = klippys(computer).into_iter().filter_map(|klippy| klippy.config).collect();
+    let usual =
+        || USUAL.iter().map(|pattern| computer.matching(pattern)).find(|found| !found.is_empty()).unwrap_or_default();
+    let found = match of_klippys.is_empty() {
+        true => usual().iter().map(|path| computer.name(path)).collect(),
+        false => of_klippys,
+    };
+    let mut found = found.into_iter();
+    match (found.next(), found.next()) {
+        (Some(path), None) => Ok(path),
+        (None, _) => Err("there is no printer.cfg: name yours with --config FILE".into()),
+        (Some(path), Some(other)) => Err(format!(
+            "there are several hosts, with {} and {}: name one with --config FILE",
+            path.display(),
+            other.display()
+        )),
+    }
+}
+
+impl Printer {
+    /// Reads it, with the files that it includes. A file that cannot be read, such as another user's, does not count.
+    ///
+    /// # Errors
+    ///
+    /// One line: printer.cfg itself cannot be read, or is a link.
+    pub(super) fn read(computer: &Computer, path: &Path) -> Result<Printer, String> {
+        let about = std::fs::symlink_metadata(computer.path(path));
+        let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", path.display()))?;
+        let owner = (about.uid(), about.gid());
+        let side = Side { computer, owner: Some(owner), records: PathBuf::new() };
+        let text = side.read(path)?.unwrap_or_default();
+        let mut printer =
+            Printer { path: path.to_owned(), owner, text, sections: BTreeMap::new(), includes: Vec::new() };
+        let mut files = 0;
+        let text = printer.text.clone();
+        printer.take(computer, path, &text, &mut Vec::new(), &mut files);
+        Ok(printer)
+    }
+
+    fn take(&mut self, computer: &Computer, path: &Path, text: &str, within: &mut Vec<PathBuf>, files: &mut usize) {
+        *files += 1;
+        if *files > FILES_MAX || within.iter().any(|outer| outer == path) {
+            return;
+        }
+        within.push(path.to_owned());
+        let mut section = String::new();
+        for line in text.lines() {
+            let line = without_comment(line).trim_end();
+            if let Some(header) = line.strip_prefix('[').and_then(|line| line.split(']').next()) {
+                section = header.trim().to_owned();
+                if let Some(pattern) = section.strip_prefix("include ") {
+                    let pattern = path.parent().unwrap_or(Path::new("/")).join(pattern.trim());
+                    for file in computer.matching(&pattern) {
+                        let file = computer.name(&file);
+                        if let Some(text) = computer.text(&file) {
+                            self.take(computer, &file, &text, within, files);
+                        }
+                    }
+                    if within.len() == 1 {
+                        self.includes.push(pattern);
+                    }
+                } else {
+                    self.sections.entry(section.clone()).or_default().files.insert(path.to_owned());
+                }
+                continue;
+            }
+            let Some((key, value)) = line.split_once([':', '=']) else { continue };
+            if !key.starts_with(char::is_whitespace)
+                && let Some(section) = self.sections.get_mut(&section)
+            {
+                section.values.insert(key.trim_end().to_owned(), value.trim().to_owned());
+            }
+        }
+        within.pop();
+    }
+
+    /// The sections with a bus or a sensor of this computer that is not there, with its file.
+    pub(super) fn absent(&self, computer: &Computer) -> Vec<(&str, Option<&str>, String)> {
+        let file = |(key, value): (&String, &String)| {
+            let name = name_of(value);
+            let is_number = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || c == '.');
+            match (key.as_str(), name.strip_prefix("spidev"), name.strip_prefix("i2c.")) {
+                ("spi_bus" | "pin", Some(number), _) if is_number(number) => Some(format!("/dev/{name}")),
+                ("i2c_bus", _, Some(number)) if is_number(number) => Some(format!("/dev/i2c-{number}")),
+                ("serial_no", ..) if name.chars().all(|c| c.is_ascii_hexdigit() || c == '-') => {
+                    Some(format!("/sys/bus/w1/devices/{name}"))
+                }
+                _ => None,
+            }
+        };
+        let absent = self.sections.iter().filter_map(|(name, section)| {
+            let file = section.values.iter().find_map(file).filter(|file| !computer.path(file).exists())?;
+            Some((name.as_str(), section.values.get("sensor_type").map(String::as_str), file))
+        });
+        absent.collect()
+    }
+
+    /// The folder of the devices' files.
+    pub(super) fn folder(&self) -> PathBuf {
+        self.path.parent().unwrap_or(Path::new("/")).join("pinion")
+    }
+
+    /// The file of a device.
+    pub(super) fn file(&self, device: &str) -> PathBuf {
+        self.folder().join(format!("{device}.cfg"))
+    }
+
+    /// A file other than the device's own that has this section.
+    pub(super) fn elsewhere(&self, device: &Device) -> Option<&Path> {
+        let own = self.file(device.name);
+        self.sections.get(&device.section)?.files.iter().find(|file| **file != own).map(PathBuf::as_path)
+    }
+
+    /// The pins that printer.cfg uses, without those of the device's own file.
+    pub(super) fn taken(&self, device: &Device) -> BTreeSet<String> {
+        let own = self.file(device.name);
+        let others = self.sections.values().filter(|section| !section.files.contains(&own));
+        let pins = others.flat_map(|section| &section.values).filter(|(key, _)| key.contains("pin"));
+        pins.flat_map(|(_, pins)| pins.split(',')).map(|pin| name_of(pin).to_owned()).collect()
+    }
+
+    /// The section other than the device's own that uses this node of a bus.
+    pub(super) fn user(&self, device: &Device, kind: Kind, node: &str) -> Option<String> {
+        let own = self.file(device.name);
+        let name = node.replacen("i2c-", "i2c.", 1);
+        let is_it = |(key, value): (&String, &String)| {
+            let value = name_of(value);
+            // The driver of an ADC takes the first chip select.
+            kind == Kind::W1 && key == "serial_no"
+                || value == name
+                || value.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('/'))
+                || node == "spidev0.0" && value.starts_with("mcp3208/")
+        };
+        let uses =
+            |(_, section): &(&String, &Section)| !section.files.contains(&own) && section.values.iter().any(is_it);
+        self.sections.iter().find(uses).map(|(section, _)| section.clone())
+    }
+
+    /// The serial numbers that thermometers of printer.cfg have, without the device's own.
+    pub(super) fn serials(&self, device: &Device) -> BTreeSet<&str> {
+        let own = self.file(device.name);
+        let others = self.sections.values().filter(|section| !section.files.contains(&own));
+        others.filter_map(|section| section.values.get("serial_no").map(String::as_str)).collect()
+    }
+
+    /// The name of this computer's MCU, and whether it has to be added.
+    pub(super) fn mcu(&self) -> (String, bool) {
+        let own = |(name, section): (&String, &Section)| {
+            let name = name.strip_prefix("mcu ")?.trim().to_owned();
+            let is_host = section.values.get("serial").is_some_and(|serial| is_host_path(Path::new(serial)));
+            is_host.then(|| (name, section.files.iter().all(|file| *file == self.file("host-mcu"))))
+        };
+        self.sections.iter().find_map(own).map_or(("host".into(), true), |(name, _)| (name, false))
+    }
+
+    /// The link by which klippy finds this computer's MCU.
+    pub(super) fn link(&self) -> &Path {
+        let serials = self.sections.values().filter_map(|section| section.values.get("serial"));
+        serials.map(Path::new).find(|serial| is_host_path(serial)).unwrap_or(Path::new(LINK))
+    }
+
+    /// The middle of the bed.
+    fn probe_point(&self) -> Option<String> {
+        let number = |section: &str, key: &str| self.sections.get(section)?.values.get(key)?.parse::<f64>().ok();
+        let middle = |axis: &str| {
+            let section = format!("stepper_{axis}");
+            let (from, to) = (number(&section, "position_min").unwrap_or(0.0), number(&section, "position_max")?);
+            // A negative minimum is beside the bed.
+            Some((from.max(0.0) + to) / 2.0)
+        };
+        if self.sections.contains_key("stepper_a") {
+            // The middle of a delta printer is its origin.
+            return Some(format!("0, 0, {PROBE_Z_MM}"));
+        }
+        Some(format!("{:.0}, {:.0}, {PROBE_Z_MM}", middle("x")?, middle("y")?))
+    }
+
+    /// The changes that add these sections for a device, and the keys of all that it needs.
+    ///
+    /// # Errors
+    ///
+    /// One line: a file in the way is not ours.
+    pub(super) fn plan(
+        &self,
+        side: &Side,
+        device: &Device,
+        sections: &str,
+    ) -> Result<(Vec<Change>, Vec<String>), String> {
+        let mut changes = Vec::new();
+        let mut needs = vec![INCLUDE.to_owned()];
+        let mut make = |key: &str, file: PathBuf, text: String| -> Result<(), String> {
+            // A file that is there is left as it is: the user may have changed it.
+            if side.read(&file)?.is_none() {
+                let splice = Splice { at: 0, old: String::new(), new: text };
+                changes.push(Change { key: key.to_owned(), file, makes: true, splice });
+            }
+            Ok(())
+        };
+        let (mcu, is_missing) = self.mcu();
+        if is_missing {
+            let text =
+                format!("# Written by pinion add. This computer's pins and buses.\n[mcu {mcu}]\nserial: {LINK}\n");
+            make(MCU, self.file("host-mcu"), text)?;
+        }
+        needs.push(MCU.to_owned());
+        let mut text = format!("# Written by pinion add {}. {}\n{}", device.name, device.title, sections.trim_start());
+        if device.resonance && !self.is_in_others("resonance_tester", device) {
+            text += &match self.probe_point() {
+                Some(point) => format!(
+                    "\n[resonance_tester]\naccel_chip: {}\n# The middle of the bed, and {PROBE_Z_MM} mm above it\nprobe_points: {point}\n",
+                    device.section
+                ),
+                None => "\n# [resonance_tester] needs your probe point: see docs/Measuring_Resonances.md of Klipper\n"
+                    .into(),
+            };
+        }
+        make(device.name, self.file(device.name), text)?;
+        let folder = self.folder();
+        let is_included = self.includes.iter().any(|pattern| {
+            let pattern = pattern.to_str().and_then(|pattern| Pattern::new(pattern).ok());
+            pattern.is_some_and(|pattern| pattern.matches_path(&folder.join("any-name.cfg")))
+        });
+        if !is_included {
+            changes.push(Change { key: INCLUDE.into(), file: self.path.clone(), makes: false, splice: self.include() });
+        }
+        Ok((changes, needs))
+    }
+
+    fn is_in_others(&self, section: &str, device: &Device) -> bool {
+        let own = self.file(device.name);
+        self.sections.get(section).is_some_and(|section| section.files.iter().any(|file| *file != own))
+    }
+
+    /// The include, behind the last one at the top of printer.cfg, or at its head. No option can stand behind an
+    /// include, so it never comes between a section and its options.
+    fn include(&self) -> Splice {
+        let end = if self.text.contains("\r\n") { "\r\n" } else { "\n" };
+        let mut at = 0;
+        let mut place = 0;
+        for line in self.text.split_inclusive('\n') {
+            at += line.len();
+            if line.starts_with("[include ") {
+                place = at;
+            }
+        }
+        let is_open = !self.text[..place].is_empty() && !self.text[..place].ends_with('\n');
+        let before = if is_open { end } else { "" };
+        Splice { at: place, old: String::new(), new: format!("{before}[include pinion/*.cfg]{end}") }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::add::catalog::Catalog;
+    use crate::cli::computer::tests::Tree;
+
+    const CONFIG: &str = "/home/pi/printer_data/config/printer.cfg";
+
+    fn read(files: &[(&str, &str)]) -> (Tree, Printer) {
+        let tree = Tree::new();
+        for (name, text) in files {
+            tree.put(&format!("home/pi/printer_data/config/{name}"), text);
+        }
+        let path = find(&tree.computer(), None).unwrap();
+        assert_eq!(path, Path::new(CONFIG));
+        let printer = Printer::read(&tree.computer(), &path).unwrap();
+        (tree, printer)
+    }
+
+    fn plan(tree: &Tree, printer: &Printer, device: &str) -> Vec<(String, String)> {
+        let catalog = Catalog::read().unwrap();
+        let device = catalog.device(device).unwrap();
+        let computer = tree.computer();
+        let side = Side { computer: &computer, owner: None, records: printer.folder() };
+        let (changes, _) = printer.plan(&side, device, "[x]\n").unwrap();
+        let name =
+            |change: &Change| change.file.strip_prefix("/home/pi/printer_data/config").unwrap().display().to_string();
+        changes.iter().map(|change| (name(change), change.splice.new.clone())).collect()
+    }
+
+    #[test]
+    fn a_device_has_its_file_and_one_include_for_all() {
+        let (tree, printer) = read(&[(
+            "printer.cfg",
+            "# mine\n[mcu]\nserial: /dev/x\n[stepper_x]\nposition_max: 250 # mm\n[stepper_y]\nposition_min: -5\nposition_max: 210\n",
+        )]);
+        let changes = plan(&tree, &printer, "adxl345");
+        let names: Vec<&str> = changes.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/adxl345.cfg", "printer.cfg"]);
+        assert!(changes[0].1.ends_with("[mcu host]\nserial: /tmp/klipper_host_mcu\n"));
+        assert!(
+            changes[1].1.ends_with(
+                "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 125, 105, 20\n"
+            ),
+            "{}",
+            changes[1].1
+        );
+        assert_eq!(changes[2].1, "[include pinion/*.cfg]\n");
+        assert_eq!(printer.include().at, 0);
+    }
+
+    #[test]
+    fn what_printer_cfg_has_already_is_not_written_again() {
+        let (tree, printer) = read(&[
+            (
+                "printer.cfg",
+                "[include pinion/*.cfg]\n[include other.cfg]\n[stepper_a]\n[fan]\npin: !rpi:GPIO17, rpi:gpio27\n",
+            ),
+            ("other.cfg", "[mcu rpi]\nserial: /tmp/klipper_host_mcu\n[resonance_tester]\naccel_chip: x\n[adxl345]\n"),
+            ("pinion/relay.cfg", "[output_pin relay]\npin: rpi:GPIO22\n"),
+        ]);
+        assert_eq!(printer.mcu(), ("rpi".into(), false));
+        assert_eq!(printer.link(), Path::new("/tmp/klipper_host_mcu"));
+        let changes = plan(&tree, &printer, "lis2dw");
+        assert_eq!(
+            changes,
+            [("pinion/lis2dw.cfg".into(), "# Written by pinion add lis2dw. accelerometer LIS2DW12\n[x]\n".into())]
+        );
+        assert_eq!(plan(&tree, &printer, "relay"), [], "its file is there");
+        let catalog = Catalog::read().unwrap();
+        let elsewhere = printer.elsewhere(catalog.device("adxl345").unwrap()).unwrap();
+        assert!(elsewhere.ends_with("other.cfg"));
+        assert_eq!(printer.elsewhere(catalog.device("relay").unwrap()), None);
+        let taken = |device: &str| printer.taken(catalog.device(device).unwrap()).into_iter().collect::<Vec<_>>();
+        assert_eq!(taken("light"), ["GPIO17", "GPIO22", "gpio27"]);
+        assert_eq!(taken("relay"), ["GPIO17", "gpio27"], "a second call chooses the same line");
+        assert_eq!(printer.probe_point().unwrap(), "0, 0, 20");
+    }
+
+    #[test]
+    fn the_include_comes_where_no_section_is_cut() {
+        for (text, at, new) in [
+            ("[include a.cfg]\n[fan]\npin: x\n[include b.cfg]\n\n[x]\n", 45, "[include pinion/*.cfg]\n"),
+            ("[fan]\r\npin: x\r\n", 0, "[include pinion/*.cfg]\r\n"),
+            ("[include a.cfg]", 15, "\n[include pinion/*.cfg]\n"),
+            ("", 0, "[include pinion/*.cfg]\n"),
+            ("#[include a.cfg]\n", 0, "[include pinion/*.cfg]\n"),
+        ] {
+            let (_tree, printer) = read(&[("printer.cfg", text)]);
+            let splice = printer.include();
+            assert_eq!((splice.at, &*splice.new), (at, new), "{text:?}");
+        }
+    }
+
+    #[test]
+    fn of_several_hosts_one_is_named_and_a_link_is_none() {
+        let tree = Tree::new();
+        assert!(find(&tree.computer(), None).unwrap_err().contains("--config"));
+        tree.put("home/a/printer_data/config/printer.cfg", "");
+        tree.put("home/b/printer_data/config/printer.cfg", "");
+        assert!(find(&tree.computer(), None).unwrap_err().contains("several hosts"));
+        tree.put("etc/shadow", "x");
+        tree.link("home/c/printer.cfg", "../../etc/shadow");
+        let error = Printer::read(&tree.computer(), Path::new("/home/c/printer.cfg")).unwrap_err();
+        assert!(error.contains("it is a link"), "{error}");
+        // A file that includes itself, or everything.
+        tree.put("home/a/printer_data/config/printer.cfg", "[include *.cfg]\n[include /*/*]\n[fan]\npin: a\n");
+        let path = Path::new("/home/a/printer_data/config/printer.cfg");
+        assert!(Printer::read(&tree.computer(), path).unwrap().sections.contains_key("fan"));
+    }
+}

@@ -1,0 +1,370 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Asks a device over its bus whether it is there, and reads what a wrong answer means.
+
+#![forbid(unsafe_code)]
+
+use pinion_firmware::board::{Board as _, BusDevice, BusError, BusStatus, I2cConfig, SpiConfig};
+use pinion_linux::LinuxBoard;
+use pinion_linux::gpio::FastGpio;
+
+use super::catalog::{Catalog, Check, Way};
+
+/// How often a register is read. A loose wire answers differently each time.
+const READS: usize = 8;
+/// Rate of I2C transfers. The kernel's driver has its own.
+const I2C_RATE_HZ: u32 = 100_000;
+/// The temperatures that a thermometer can report, in degrees Celsius.
+const TEMPERATURES: std::ops::RangeInclusive<f64> = -40.0..=150.0;
+/// The bit of an SPI chip's register address that means reading.
+const SPI_READ: u8 = 0x80;
+
+/// What a device has answered.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Answer {
+    /// In words, for a reader.
+    pub(super) told: String,
+    /// The I2C address that it has.
+    pub(super) address: Option<u8>,
+}
+
+/// What is known of the answers on a bus.
+pub(super) trait Buses {
+    /// Opens the SPI device.
+    ///
+    /// # Errors
+    ///
+    /// One line with cause and remedy.
+    fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String>;
+
+    /// Opens an I2C address.
+    ///
+    /// # Errors
+    ///
+    /// One line with cause and remedy.
+    fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String>;
+}
+
+/// The buses of this computer.
+pub(super) struct Live {
+    board: LinuxBoard,
+    /// The bus's number on the wire.
+    bus: u32,
+}
+
+impl Live {
+    /// The bus of a node, such as `spidev0.0` or `i2c-1`.
+    pub(super) fn of(node: &str) -> Option<Live> {
+        let bus = match node.strip_prefix("spidev") {
+            Some(numbers) => {
+                let (bus, select) = numbers.split_once('.')?;
+                pinion_linux::spi::Node { bus: bus.parse().ok()?, select: select.parse().ok()? }.number()?
+            }
+            None => node.strip_prefix("i2c-")?.parse().ok()?,
+        };
+        Some(Live { board: LinuxBoard::new(None, FastGpio::Off), bus })
+    }
+}
+
+impl Buses for Live {
+    fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+        let config = SpiConfig { bus: self.bus, mode: way.mode, rate_hz: way.rate_hz, chip_select: None };
+        self.board.spi(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())
+    }
+
+    fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String> {
+        let config = I2cConfig { bus: self.bus, address, rate_hz: I2C_RATE_HZ };
+        self.board.i2c(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())
+    }
+}
+
+/// Asks the device.
+///
+/// # Errors
+///
+/// One line: what it has answered, what that means, and what to do.
+pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result<Answer, String> {
+    let Some(check) = &way.check else {
+        return Ok(Answer { told: "it cannot be asked: try it out".into(), address: None });
+    };
+    if way.addresses.is_empty() {
+        let mut device = buses.spi(way)?;
+        return match check {
+            Check::Id { register, ids } => {
+                let mut read = || exchange(&mut *device, Some(*register), 1).map(|bytes| bytes[0]);
+                // A chip that speaks I2C until the first edge of its chip select answers nothing here.
+                read()?;
+                let answers = (0..READS).map(|_| read()).collect::<Result<Vec<u8>, String>>()?;
+                judge(catalog, *register, ids, &answers).map(|told| Answer { told, address: None })
+            }
+            Check::Alive { register, bytes } => {
+                let answer = exchange(&mut *device, *register, *bytes)?;
+                match silence(&answer) {
+                    Some(why) => Err(why),
+                    None => Ok(Answer { told: format!("it answers {}", hex(&answer)), address: None }),
+                }
+            }
+            _ => Ok(Answer { told: "it cannot be asked over SPI: try it out".into(), address: None }),
+        };
+    }
+    let mut others = Vec::new();
+    let mut wrong = None;
+    for address in &way.addresses {
+        let mut device = buses.i2c(*address)?;
+        match asked(catalog, check, &mut *device) {
+            Ok(told) => {
+                return Ok(Answer { told: format!("{told} at address {address:#04x}"), address: Some(*address) });
+            }
+            Err(Failure::Nobody) => {}
+            Err(Failure::Bus(why)) => return Err(why),
+            Err(Failure::Wrong(why)) => {
+                others.push(*address);
+                wrong.get_or_insert(format!("at address {address:#04x}: {why}"));
+            }
+        }
+    }
+    if let Some(wrong) = wrong {
+        return Err(wrong);
+    }
+    let asked: Vec<String> = way.addresses.iter().map(|address| format!("{address:#04x}")).collect();
+    Err(format!("nobody answers at {}: check power, ground, and that SDA and SCL are not swapped", asked.join(" or ")))
+}
+
+/// Why an I2C chip is not the expected one.
+enum Failure {
+    /// No chip has the address.
+    Nobody,
+    /// The bus does not work.
+    Bus(String),
+    /// Another answer than expected.
+    Wrong(String),
+}
+
+fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result<String, Failure> {
+    let mut read = |write: &[u8], count: usize| {
+        let mut bytes = vec![0; count];
+        device.read_register(write, &mut bytes).map(|()| bytes).map_err(|error: BusError| match error.status {
+            BusStatus::StartNack | BusStatus::Nack => Failure::Nobody,
+            _ => Failure::Bus(error.trouble.to_string()),
+        })
+    };
+    match check {
+        Check::Id { register, ids } => {
+            let answers: Vec<u8> =
+                (0..READS).map(|_| read(&[*register], 1).map(|bytes| bytes[0])).collect::<Result<_, _>>()?;
+            judge(catalog, *register, ids, &answers).map_err(Failure::Wrong)
+        }
+        Check::Answer { write, bytes, crc } => {
+            let answer = read(write, *bytes)?;
+            if *crc && answer.len() == 3 && crc8(&answer[..2]) != answer[2] {
+                return Err(Failure::Wrong(format!("{} has a wrong CRC: shorten the wires", hex(&answer))));
+            }
+            Ok("it answers".into())
+        }
+        Check::Temperature { write, bytes } => {
+            let answer = read(write, *bytes)?;
+            let high = answer.first().copied().unwrap_or_default();
+            let low = answer.get(1).copied().unwrap_or_default();
+            let degrees = f64::from(i16::from_be_bytes([high, low])) / 256.0;
+            match TEMPERATURES.contains(&degrees) {
+                true => Ok(format!("it measures {degrees:.1} degrees")),
+                false => Err(Failure::Wrong(format!("{degrees:.1} degrees is no temperature: it is another chip"))),
+            }
+        }
+        Check::Alive { .. } | Check::W1 => Ok("it cannot be asked over I2C: try it out".into()),
+    }
+}
+
+fn exchange(device: &mut dyn BusDevice, register: Option<u8>, count: usize) -> Result<Vec<u8>, String> {
+    // The MAX31856 and MAX31865 count their registers from 0 and have the bit for writing: reading is 0 there.
+    let head: Vec<u8> = match register {
+        Some(register) if count == 1 => vec![register | SPI_READ],
+        Some(register) => vec![register],
+        None => Vec::new(),
+    };
+    let mut bytes = vec![0; head.len() + count];
+    bytes[..head.len()].copy_from_slice(&head);
+    device.exchange(&mut bytes).map_err(|error| error.trouble.to_string())?;
+    Ok(bytes.split_off(head.len()))
+}
+
+/// The meaning of a chip's answers to the question for its id.
+fn judge(catalog: &Catalog, register: u8, ids: &[u8], answers: &[u8]) -> Result<String, String> {
+    let first = answers.first().copied().unwrap_or_default();
+    if answers.iter().any(|answer| *answer != first) {
+        return Err(format!(
+            "its id changes from read to read ({}): a wire is loose, too long, or beside a motor's cable",
+            hex(answers)
+        ));
+    }
+    if ids.contains(&first) {
+        return Ok(format!("its id is {first:#04x}"));
+    }
+    if let Some(why) = silence(&[first]) {
+        return Err(why);
+    }
+    let wanted = ids.first().copied().unwrap_or_default();
+    let told = format!("its id is {first:#04x} instead of {wanted:#04x}");
+    let is_shifted = ids.iter().any(|id| [id >> 1, id >> 1 | 0x80, id << 1, id << 1 | 1].contains(&first));
+    if is_shifted {
+        return Err(format!("{told}, shifted by a bit: shorten the wires, twist SCLK and CS each with ground"));
+    }
+    match catalog.with_id(register, first) {
+        Some(other) => Err(format!("{told}, that of another chip: pinion add {}", other.name)),
+        None => Err(format!("{told}: it is another chip, or data wires are swapped")),
+    }
+}
+
+/// What all zeros or all ones mean.
+fn silence(answer: &[u8]) -> Option<String> {
+    let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
+    if is_all(0) {
+        return Some(
+            "it answers all zeros: no power, the chip's data output (SDO, MISO) or CS is not connected, or the pin is \
+             still GPIO"
+                .into(),
+        );
+    }
+    is_all(0xff).then(|| {
+        "it answers all ones: no ground, CS does not reach the chip, or its data input (SDA, MOSI) or clock is not \
+         connected"
+            .into()
+    })
+}
+
+/// The CRC of Sensirion's chips: polynomial 0x31, begun with 0xff (data sheet of the SHT3x).
+fn crc8(bytes: &[u8]) -> u8 {
+    bytes.iter().fold(0xff, |crc, byte| {
+        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { crc << 1 ^ 0x31 } else { crc << 1 })
+    })
+}
+
+fn hex(bytes: &[u8]) -> String {
+    let bytes: Vec<String> = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+    bytes.join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::trouble::Trouble;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
+
+    /// Chips that answer a register with these bytes, one after the other. SPI has the address 0.
+    #[derive(Clone, Default)]
+    struct Chips(BTreeMap<u8, Vec<u8>>);
+
+    struct Chip {
+        answers: Vec<u8>,
+        next: usize,
+        is_there: bool,
+    }
+
+    impl Chip {
+        fn fill(&mut self, bytes: &mut [u8]) {
+            for byte in bytes {
+                *byte = self.answers[self.next % self.answers.len()];
+                self.next += 1;
+            }
+        }
+    }
+
+    impl BusDevice for Chip {
+        fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+            let head = usize::from(bytes.len() == 2);
+            self.fill(&mut bytes[head..]);
+            Ok(())
+        }
+
+        fn write_read(&mut self, _write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+            if !self.is_there {
+                return Err(BusError::new(BusStatus::StartNack, Trouble::new("nobody")));
+            }
+            self.fill(read);
+            Ok(())
+        }
+    }
+
+    impl Buses for Chips {
+        fn spi(&mut self, _way: &Way) -> Result<Box<dyn BusDevice>, String> {
+            Ok(Box::new(Chip { answers: self.0[&0].clone(), next: 0, is_there: true }))
+        }
+
+        fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String> {
+            let answers = self.0.get(&address).cloned();
+            Ok(Box::new(Chip { is_there: answers.is_some(), answers: answers.unwrap_or_default(), next: 0 }))
+        }
+    }
+
+    fn told(device: &str, way: usize, chips: &[(u8, &[u8])]) -> Result<Answer, String> {
+        let catalog = Catalog::read().unwrap();
+        let way = &catalog.device(device).unwrap().way[way];
+        let mut chips = Chips(chips.iter().map(|(address, bytes)| (*address, bytes.to_vec())).collect());
+        ask(&catalog, way, &mut chips)
+    }
+
+    #[test]
+    fn a_chip_s_answer_is_read() {
+        for (answer, words) in [
+            (0xe5, None),
+            (0x00, Some("all zeros: no power")),
+            (0xff, Some("all ones: no ground")),
+            // Both were reported by users of Klipper.
+            (0xf2, Some("0xf2 instead of 0xe5, shifted by a bit")),
+            (0x72, Some("0x72 instead of 0xe5, shifted by a bit")),
+            (0xea, Some("that of another chip: pinion add icm20948")),
+            (0x42, Some("it is another chip")),
+        ] {
+            let result = told("adxl345", 0, &[(0, &[answer])]);
+            match words {
+                None => assert_eq!(result.unwrap().told, "its id is 0xe5"),
+                Some(words) => assert!(result.as_ref().unwrap_err().contains(words), "{result:?}"),
+            }
+        }
+        let noise = told("adxl345", 0, &[(0, &[0xe5, 0x12, 0xe5, 0xff])]).unwrap_err();
+        assert!(noise.starts_with("its id changes from read to read (12 e5 ff"), "{noise}");
+        assert_eq!(told("lis2dw", 0, &[(0, &[0x33])]).unwrap_err().rsplit_once(": ").unwrap().1, "pinion add lis3dh");
+        assert!(told("max31855", 0, &[(0, &[0; 4])]).unwrap_err().contains("all zeros"));
+        assert!(told("max31856", 0, &[(0, &[0xff])]).unwrap_err().contains("all ones"));
+        assert_eq!(told("max31855", 0, &[(0, &[1, 0x90, 0x19, 0])]).unwrap().told, "it answers 01 90 19 00");
+    }
+
+    #[test]
+    fn a_chip_is_found_at_its_other_address() {
+        let answer = told("bme280", 0, &[(0x77, &[0x60])]).unwrap();
+        assert_eq!((answer.address, &*answer.told), (Some(0x77), "its id is 0x60 at address 0x77"));
+        assert_eq!(told("bme280", 0, &[(0x76, &[0x58]), (0x77, &[0x60])]).unwrap().address, Some(0x76));
+        // A stranger at the first address does not hide the chip at the second.
+        assert_eq!(told("bme280", 0, &[(0x76, &[0x12]), (0x77, &[0x60])]).unwrap().address, Some(0x77));
+        let error = told("bme280", 0, &[]).unwrap_err();
+        assert!(error.starts_with("nobody answers at 0x76 or 0x77: check power"), "{error}");
+        let error = told("mpu9250", 0, &[(0x69, &[0x19])]).unwrap_err();
+        assert!(error.starts_with("at address 0x69: its id is 0x19 instead of 0x74"), "{error}");
+        assert_eq!(told("ssd1306", 0, &[(0x3d, &[0])]).unwrap().address, Some(0x3d));
+    }
+
+    #[test]
+    fn a_temperature_and_a_crc_are_checked() {
+        assert_eq!(told("lm75", 0, &[(0x48, &[0x19, 0x80])]).unwrap().told, "it measures 25.5 degrees at address 0x48");
+        assert_eq!(told("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().told, "it measures -10.0 degrees at address 0x4f");
+        assert!(told("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is no temperature"));
+        // The example of the SHT3x's data sheet.
+        assert_eq!(crc8(&[0xbe, 0xef]), 0x92);
+        assert!(told("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
+        assert!(told("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
+    }
+
+    proptest! {
+        #[test]
+        fn any_answer_has_a_meaning(answers in prop::collection::vec(any::<u8>(), 1..8)) {
+            let catalog = Catalog::read().unwrap();
+            for device in &catalog.devices {
+                for way in &device.way {
+                    let addresses = way.addresses.iter().chain([&0]);
+                    let mut chips = Chips(addresses.map(|address| (*address, answers.clone())).collect());
+                    let _ = ask(&catalog, way, &mut chips);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,504 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion add` from outside, on folders that look like the cards of boards.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, chown, symlink};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::thread;
+use std::time::Duration;
+
+use pinion_testkit::here;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::process::{output, program};
+
+const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
+const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
+                           [stepper_y]\nposition_min: -5\nposition_max: 310\n\
+                           #*# <---------------------- SAVE_CONFIG ---------------------->\n#*# [input_shaper]\n";
+/// The end of config.txt in Raspberry Pi OS 12.
+const CONFIG_TXT: &str = "#dtparam=i2c_arm=on\n#dtparam=spi=on\ndtparam=audio=on\n[cm4]\notg_mode=1\n[all]\n";
+/// The file of BigTreeTech's image for the CB1.
+const BOARD_ENV: &str = "bootlogo=true\noverlay_prefix=sun50i-h616\nfdtfile=sun50i-h616-biqu-sd\nconsole=display\n\
+                         #overlays=tft35_spi\noverlays=ws2812 light\nrootdev=UUID=795df55f\nrootfstype=ext4\n";
+/// The file of Armbian.
+const ARMBIAN_ENV: &str =
+    "verbosity=1\nbootlogo=false\nconsole=both\noverlay_prefix=PREFIX\nrootdev=UUID=88c29f81\nrootfstype=ext4\n";
+
+/// A card with a board's system.
+struct Card(TempDir);
+
+impl Card {
+    fn of(model: &str, files: &[(&str, &str)]) -> Card {
+        let card = Card(tempfile::tempdir().unwrap());
+        card.put("proc/device-tree/model", &format!("{model}\0"));
+        card.put(PRINTER, PRINTER_CFG);
+        card.put(&PRINTER.replace("printer.cfg", "mainsail.cfg"), "[virtual_sdcard]\npath: ~/gcodes\n");
+        files.iter().for_each(|(path, text)| card.put(path, text));
+        card
+    }
+
+    fn pi() -> Card {
+        Card::of("Raspberry Pi 4 Model B Rev 1.4", &[("boot/firmware/config.txt", CONFIG_TXT)])
+    }
+
+    fn path(&self, path: &str) -> PathBuf {
+        self.0.path().join(path)
+    }
+
+    fn put(&self, path: &str, text: &str) {
+        let path = self.path(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    fn read(&self, path: &str) -> String {
+        fs::read_to_string(self.path(path)).unwrap()
+    }
+
+    fn arguments(&self, args: &[&str]) -> Vec<String> {
+        let root = self.0.path().to_str().unwrap().to_owned();
+        ["add".to_owned()]
+            .into_iter()
+            .chain(args.iter().map(|arg| (*arg).to_owned()))
+            .chain(["--root".to_owned(), root])
+            .collect()
+    }
+
+    fn add(&self, args: &[&str]) -> Output {
+        let arguments = self.arguments(args);
+        output(&arguments.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+
+    #[track_caller]
+    fn added(&self, args: &[&str]) -> String {
+        let output = self.add(args);
+        let (out, log) =
+            (String::from_utf8(output.stdout).unwrap(), String::from_utf8_lossy(&output.stderr).into_owned());
+        assert_eq!(output.status.code(), Some(0), "{out}{log}");
+        out
+    }
+
+    #[track_caller]
+    fn refused(&self, args: &[&str]) -> String {
+        let output = self.add(args);
+        assert_eq!(output.status.code(), Some(1), "{output:?}");
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    }
+
+    /// All files, with their bytes and modes, and the folders.
+    fn snapshot(&self) -> Vec<(PathBuf, Vec<u8>, u32)> {
+        let mut found = Vec::new();
+        let mut folders = vec![self.0.path().to_owned()];
+        while let Some(folder) = folders.pop() {
+            for entry in fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                let about = fs::symlink_metadata(&path).unwrap();
+                if about.is_dir() {
+                    folders.push(path.clone());
+                }
+                let bytes = if about.is_file() { fs::read(&path).unwrap() } else { Vec::new() };
+                found.push((path, bytes, about.mode()));
+            }
+        }
+        // The folder of the records stays: the package has it, too.
+        found.retain(|(path, ..)| !path.starts_with(self.path("var")));
+        found.sort();
+        found
+    }
+}
+
+#[test]
+fn each_board_gets_its_own_line_and_back() {
+    let dtbo = |name: &'static str| (name, "");
+    let armbian = |prefix: &str| ARMBIAN_ENV.replace("PREFIX", prefix);
+    let (h616, h6, rk35) = (armbian("sun50i-h616"), armbian("sun50i-h6"), armbian("rk35xx"));
+    let pi = |file: &'static str| vec![(file, CONFIG_TXT)];
+    for (model, files, file, line, node) in [
+        ("Raspberry Pi 2 Model B Rev 1.1", pi("boot/config.txt"), "boot/config.txt", "dtparam=spi=on", "spidev0.0"),
+        (
+            "Raspberry Pi 3 Model B Plus Rev 1.3",
+            pi("boot/firmware/config.txt"),
+            "boot/firmware/config.txt",
+            "dtparam=spi=on",
+            "spidev0.0",
+        ),
+        (
+            "Raspberry Pi Zero 2 W Rev 1.0",
+            pi("boot/firmware/config.txt"),
+            "boot/firmware/config.txt",
+            "dtparam=spi=on",
+            "spidev0.0",
+        ),
+        (
+            "Raspberry Pi 4 Model B Rev 1.4",
+            pi("boot/firmware/config.txt"),
+            "boot/firmware/config.txt",
+            "dtparam=spi=on",
+            "spidev0.0",
+        ),
+        (
+            "Raspberry Pi 5 Model B Rev 1.0",
+            pi("boot/firmware/config.txt"),
+            "boot/firmware/config.txt",
+            "dtparam=spi=on",
+            "spidev0.0",
+        ),
+        (
+            "BigTreeTech CB1",
+            vec![("boot/BoardEnv.txt", BOARD_ENV), dtbo("boot/dtb/allwinner/overlay/sun50i-h616-spidev1_1.dtbo")],
+            "boot/BoardEnv.txt",
+            "overlays=ws2812 light spidev1_1",
+            "spidev1.1",
+        ),
+        (
+            "BigTreeTech CB1",
+            vec![
+                ("boot/BoardEnv.txt", BOARD_ENV),
+                ("boot/system.cfg", "BTT_PAD7=\"ON\"\n"),
+                dtbo("boot/dtb/allwinner/overlay/sun50i-h616-spidev1_1.dtbo"),
+            ],
+            "boot/BoardEnv.txt",
+            "overlays=ws2812 light spidev1_1",
+            "spidev1.1",
+        ),
+        (
+            "OrangePi Zero3",
+            vec![("boot/armbianEnv.txt", &*h616), dtbo("boot/dtb/allwinner/overlay/sun50i-h616-spidev1_1.dtbo")],
+            "boot/armbianEnv.txt",
+            "overlays=spidev1_1",
+            "spidev1.1",
+        ),
+        (
+            "OrangePi 3 LTS",
+            vec![("boot/armbianEnv.txt", &*h6), dtbo("boot/dtb/allwinner/overlay/sun50i-h6-spi-spidev.dtbo")],
+            "boot/armbianEnv.txt",
+            "param_spidev_spi_bus=1",
+            "spidev1.0",
+        ),
+        (
+            "Radxa ZERO 3W",
+            vec![("boot/armbianEnv.txt", &*rk35), dtbo("boot/dtb/rockchip/overlay/rk3568-spi3-m1-cs0-spidev.dtbo")],
+            "boot/armbianEnv.txt",
+            "overlays=rk3568-spi3-m1-cs0-spidev",
+            "spidev3.0",
+        ),
+    ] {
+        let card = Card::of(model, &files);
+        let before = card.snapshot();
+        let shown = card.added(&["adxl345", "--dry-run"]);
+        assert_eq!(card.snapshot(), before, "{model}: --dry-run");
+        assert!(shown.contains(&format!("\n+ {line}\n")) && shown.contains("SDA"), "{shown}");
+        card.added(&["adxl345", "--yes"]);
+        assert!(card.read(file).lines().any(|own| own == line), "{model}: {}", card.read(file));
+        let own = card.read(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"));
+        assert!(own.contains(&format!("[adxl345]\ncs_pin: host:None\nspi_bus: {node}\n")), "{own}");
+        assert!(own.ends_with("probe_points: 150, 155, 20\n"), "{own}");
+        assert!(
+            card.read(PRINTER).starts_with("# my printer\n[include mainsail.cfg]\n[include pinion/*.cfg]\n\n[printer]")
+        );
+        assert_eq!(card.read(&format!("{PRINTER}.before-add-adxl345")), PRINTER_CFG);
+        let once = card.snapshot();
+        let told = card.added(&["adxl345", "--yes"]);
+        assert_eq!(card.snapshot(), once, "{model}: twice");
+        assert!(told.contains("Nothing is left to change."), "{told}");
+        card.added(&["adxl345", "--undo", "--yes"]);
+        assert_eq!(card.snapshot(), before, "{model}: --undo");
+    }
+}
+
+/// All devices after each other, and back in another order.
+#[test]
+fn all_devices_of_a_board_and_back() {
+    let card = Card::pi();
+    fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o640)).unwrap();
+    card.put("sys/bus/w1/devices/28-0316a4f1ff27/w1_slave", "");
+    card.put("etc/modules-load.d/cups-filters.conf", "lp\n");
+    let before = card.snapshot();
+    let list: Value = serde_json::from_slice(&card.add(&["--json"]).stdout).unwrap();
+    let devices = list["devices"].as_array().unwrap().iter().filter(|device| device["fits"] == true);
+    let devices: Vec<&str> = devices.map(|device| device["name"].as_str().unwrap()).collect();
+    assert_eq!(devices.len(), 28);
+    let mut added = Vec::new();
+    for device in &devices {
+        // Not all of them have room beside each other.
+        if card.add(&[device, "--yes"]).status.success() {
+            added.push(*device);
+        }
+    }
+    assert!(added.len() >= 17, "{added:?}");
+    let relay = card.read(&PRINTER.replace("printer.cfg", "pinion/relay.cfg"));
+    let light = card.read(&PRINTER.replace("printer.cfg", "pinion/light.cfg"));
+    let pin = |text: &str| text.lines().find(|line| line.starts_with("pin: ")).unwrap().to_owned();
+    assert_ne!(pin(&relay), pin(&light));
+    assert_eq!(card.read("boot/firmware/config.txt").matches("dtparam=spi=on").count(), 2, "one of them is a comment");
+    let (even, odd): (Vec<_>, Vec<_>) = added.iter().enumerate().partition(|(number, _)| number % 2 == 0);
+    for (_, device) in even.into_iter().chain(odd) {
+        card.added(&[device, "--undo", "--yes"]);
+    }
+    assert_eq!(card.snapshot(), before);
+}
+
+#[test]
+fn programs_get_the_same_as_json() {
+    let card = Card::pi();
+    let value: Value = serde_json::from_slice(&card.add(&["adxl345", "--json", "--yes"]).stdout).unwrap();
+    assert_eq!(value["device"], "adxl345");
+    assert_eq!(value["board"], "Raspberry Pi 4");
+    assert_eq!(value["wires"][2]["pin"], 24);
+    let files: Vec<&str> =
+        value["changes"].as_array().unwrap().iter().map(|change| change["file"].as_str().unwrap()).collect();
+    assert_eq!(files[0], "/boot/firmware/config.txt");
+    assert_eq!(files.len(), 4);
+    assert!(value["error"].is_null() && value["next"][0] == "ACCELEROMETER_QUERY");
+    // Nobody can be asked.
+    let output = card.add(&["relay", "--json"]);
+    let value: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(value["error"].as_str().unwrap().contains("call it with --yes"));
+    assert_eq!(output.status.code(), Some(1));
+}
+
+#[test]
+fn a_picture_of_the_wires() {
+    let card = Card::pi();
+    let picture = card.path("wires.svg");
+    card.added(&["lis2dw", "--bus", "I2C", "--dry-run", "--picture", picture.to_str().unwrap()]);
+    let svg = fs::read_to_string(picture).unwrap();
+    let document = roxmltree::Document::parse(&svg).unwrap();
+    assert_eq!(document.descendants().filter(|node| node.has_tag_name("path")).count(), 4);
+    let shown = card.added(&["relay", "--pin", "40", "--dry-run"]);
+    assert!(shown.contains("pin 40") && shown.contains("+ pin: host:GPIO21"), "{shown}");
+    assert!(card.refused(&["relay", "--pin", "1", "--dry-run"]).contains("--pin: this pin has no free line"));
+    assert!(card.refused(&["relay", "--bus", "spi"]).contains("--bus: relay is connected by GPIO lines"));
+    assert!(card.refused(&["adxl354"]).contains("did you mean adxl345?"));
+}
+
+#[test]
+fn an_unknown_board_is_told_what_to_look_up() {
+    for model in ["Pine64+", "", "\u{1b}[2J\u{202e}Raspberry\nPi 4", &"x".repeat(100_000)] {
+        let card = Card::of(model, &[]);
+        let before = card.snapshot();
+        let list = card.added(&[]);
+        assert!(list.contains("look up in its manual") && list.contains("adxl345"), "{list}");
+        assert!(!list.contains(['\u{1b}', '\u{202e}']));
+        assert!(card.refused(&["adxl345", "--yes"]).contains("look up in its manual which pins have SPI"));
+        assert_eq!(card.snapshot(), before);
+    }
+    let card = Card::of("BigTreeTech CB1", &[("boot/BoardEnv.txt", BOARD_ENV)]);
+    assert!(card.refused(&["adxl345", "--yes"]).contains("this image has no overlay for spidev1.1"));
+    assert!(card.refused(&["bme280", "--yes"]).contains("has no known I2C on its header"));
+    let card = Card::of("Raspberry Pi 4", &[]);
+    assert!(
+        card.refused(&["adxl345", "--yes"]).contains("none of /boot/firmware/config.txt, /boot/config.txt is there")
+    );
+}
+
+#[test]
+fn nothing_is_written_through_links_or_outside() {
+    let card = Card::pi();
+    card.put("etc/shadow", "secret\n");
+    let elsewhere = card.path("etc/shadow");
+    for link in [PRINTER, "boot/firmware/config.txt"] {
+        let path = card.path(link);
+        let text = fs::read(&path).unwrap();
+        fs::remove_file(&path).unwrap();
+        symlink(&elsewhere, &path).unwrap();
+        let before = card.snapshot();
+        let log = card.refused(&["adxl345", "--yes", "--config", &format!("/{PRINTER}")]);
+        assert!(log.contains("it is a link"), "{log}");
+        assert_eq!(card.snapshot(), before);
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, text).unwrap();
+    }
+    // A link in the place of the folder of the devices: files go where the user has it, not through a file's link.
+    let folder = PRINTER.replace("printer.cfg", "pinion");
+    fs::create_dir(card.path(&folder)).unwrap();
+    symlink(&elsewhere, card.path(&format!("{folder}/adxl345.cfg"))).unwrap();
+    assert!(card.refused(&["adxl345", "--yes"]).contains("it is a link"));
+    assert_eq!(card.read("etc/shadow"), "secret\n");
+}
+
+/// root's call. The rights are those of the whole process, so no unit test takes them.
+#[test]
+fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
+    if !here::is_root() {
+        return;
+    }
+    let nobody = 65534;
+    let card = Card::pi();
+    fs::set_permissions(card.path(""), fs::Permissions::from_mode(0o755)).unwrap();
+    let config = Path::new(PRINTER).parent().unwrap().to_str().unwrap();
+    for path in ["home/pi", "home/pi/printer_data", config, PRINTER] {
+        chown(card.path(path), Some(nobody), Some(nobody)).unwrap();
+    }
+    let before = card.snapshot();
+    card.added(&["adxl345", "--yes"]);
+    let owner = |path: &str| {
+        let about = fs::symlink_metadata(card.path(path)).unwrap();
+        (about.uid(), about.gid())
+    };
+    for name in
+        ["printer.cfg", "printer.cfg.before-add-adxl345", "pinion", "pinion/adxl345.cfg", "pinion/.add-adxl345.json"]
+    {
+        assert_eq!(owner(&format!("{config}/{name}")), (nobody, nobody), "{name}");
+    }
+    assert_eq!(owner("boot/firmware/config.txt"), (0, 0));
+    card.added(&["adxl345", "--undo", "--yes"]);
+    assert_eq!(card.snapshot(), before);
+    // Whatever the owner puts in the way: root's folder is not theirs to write to.
+    card.put("root/kept", "root's\n");
+    symlink(card.path("root"), card.path(&format!("{config}/pinion"))).unwrap();
+    let log = card.refused(&["relay", "--yes"]);
+    assert!(log.contains("ermission denied"), "{log}");
+    assert_eq!(fs::read_dir(card.path("root")).unwrap().count(), 1);
+    // A record that leads elsewhere is followed with the owner's rights only.
+    fs::remove_file(card.path(&format!("{config}/pinion"))).unwrap();
+    let record = r#"{"changes":[{"key":"x","file":"/root/kept","makes":false,"splice":{"at":0,"old":"theirs","new":"root's"}}],"needs":[]}"#;
+    card.put(&format!("{config}/pinion/.add-relay.json"), record);
+    for name in ["pinion", "pinion/.add-relay.json"] {
+        chown(card.path(&format!("{config}/{name}")), Some(nobody), Some(nobody)).unwrap();
+    }
+    assert!(card.refused(&["relay", "--undo", "--yes"]).contains("ermission denied"));
+    assert_eq!(card.read("root/kept"), "root's\n");
+}
+
+/// What a disk without room does to a write: the kernel refuses it.
+#[test]
+fn a_full_disk_leaves_the_old_files() {
+    let card = Card::pi();
+    let before = card.snapshot();
+    let full = Command::new("sh")
+        .args(["-c", "trap '' XFSZ; ulimit -f 0; exec \"$0\" \"$@\" 2>&1 | cat"])
+        .arg(env!("CARGO_BIN_EXE_pinion"))
+        .args(card.arguments(&["adxl345", "--yes"]))
+        .output()
+        .unwrap();
+    let told = String::from_utf8_lossy(&full.stdout);
+    assert!(told.contains("/var/lib/pinion-mcu/add/.add-adxl345.json: File too large"), "{told}");
+    assert_eq!(card.snapshot(), before);
+    card.added(&["adxl345", "--yes"]);
+    card.added(&["adxl345", "--undo", "--yes"]);
+    assert_eq!(card.snapshot(), before);
+}
+
+/// Kills the program at many moments. Each file is the old or the new one, and a later call finishes.
+#[test]
+fn a_kill_leaves_each_file_old_or_new() {
+    let whole = Card::pi();
+    whole.added(&["adxl345", "--yes"]);
+    for round in 0..24u64 {
+        let card = Card::pi();
+        let before = card.snapshot();
+        let undoes = round % 2 == 1;
+        if undoes {
+            card.added(&["adxl345", "--yes"]);
+        }
+        let arguments = card.arguments(if undoes { &["adxl345", "--yes", "--undo"] } else { &["adxl345", "--yes"] });
+        let mut child = program().args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        thread::sleep(Duration::from_micros(700 * round));
+        // It may have ended already.
+        let _ = child.kill();
+        child.wait().unwrap();
+        for path in [PRINTER, "boot/firmware/config.txt"] {
+            let old = if path == PRINTER { PRINTER_CFG } else { CONFIG_TXT };
+            let now = card.read(path);
+            assert!(now == old || now == whole.read(path), "round {round}: {path}: {now}");
+        }
+        card.added(&["adxl345", "--yes"]);
+        card.added(&["adxl345", "--undo", "--yes"]);
+        assert_eq!(card.snapshot(), before, "round {round}");
+    }
+}
+
+/// A Moonraker whose host does this. It answers until it is dropped, and returns the requests.
+fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let server = thread::spawn(move || {
+        let mut requests = Vec::new();
+        let mut queried = false;
+        loop {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut request = Vec::new();
+            let mut byte = [0];
+            while !request.ends_with(b"\r\n\r\n") && stream.read(&mut byte).unwrap() == 1 {
+                request.push(byte[0]);
+            }
+            let request = String::from_utf8(request).unwrap();
+            let line = request.lines().next().unwrap_or_default().to_owned();
+            let body = if line.contains("objects/query") {
+                format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
+            } else if line.contains("printer/info") {
+                "{\"result\":{\"state\":\"ready\"}}".to_owned()
+            } else if line.contains("gcode_store") && queried {
+                "{\"result\":{\"gcode_store\":[{\"time\":2.0,\"type\":\"response\",\"message\":\
+                 \"// accelerometer values (x, y, z): 470.0, 941.0, 9728.0\"}]}}"
+                    .to_owned()
+            } else {
+                "{\"result\":{\"gcode_store\":[]}}".to_owned()
+            };
+            queried |= line.contains("ACCELEROMETER_QUERY");
+            if line.is_empty() {
+                return requests;
+            }
+            requests.push(line);
+            stream.write_all(format!("HTTP/1.1 200 OK\r\n\r\n{body}").as_bytes()).unwrap();
+        }
+    });
+    (address, server)
+}
+
+fn end(address: &str, server: thread::JoinHandle<Vec<String>>) -> Vec<String> {
+    std::net::TcpStream::connect(address).unwrap().write_all(b"\r\n\r\n").unwrap();
+    server.join().unwrap()
+}
+
+#[test]
+fn the_host_restarts_and_measures_and_never_while_it_prints() {
+    let card = Card::pi();
+    let before = card.snapshot();
+    for state in ["printing", "paused"] {
+        let (address, server) = moonraker(state);
+        for more in [&[][..], &["--undo"]] {
+            let log = card.add(&[&["adxl345", "--yes", "--moonraker", &address], more].concat());
+            let log = String::from_utf8_lossy(&log.stderr).into_owned();
+            assert!(log.contains("the host prints") || more.contains(&"--undo") && log.is_empty(), "{log}");
+        }
+        assert_eq!(card.snapshot(), before);
+        assert!(end(&address, server).iter().all(|request| request.starts_with("GET /printer/objects/query")));
+    }
+    let (address, server) = moonraker("standby");
+    let told = card.added(&["adxl345", "--yes", "--moonraker", &address]);
+    assert!(told.contains("it measures 470, 941, 9728 mm/s2: 1.00 of gravity"), "{told}");
+    assert!(told.contains("SHAPER_CALIBRATE"), "{told}");
+    let requests = end(&address, server);
+    assert!(requests.iter().any(|request| request.starts_with("POST /printer/firmware_restart ")), "{requests:?}");
+    // Nothing is changed, so nothing restarts.
+    let (address, server) = moonraker("standby");
+    card.added(&["adxl345", "--yes", "--moonraker", &address]);
+    assert!(!end(&address, server).iter().any(|request| request.contains("restart")));
+}
+
+#[test]
+fn a_file_that_is_the_user_s_stays() {
+    let card = Card::pi();
+    let own = PRINTER.replace("printer.cfg", "pinion/relay.cfg");
+    card.put(&own, "[output_pin relay]\npin: host:GPIO5\n");
+    card.put(PRINTER, &format!("[include pinion/*.cfg]\n{PRINTER_CFG}[mcu rpi]\nserial: /tmp/klipper_host_mcu\n[adxl345]\ncs_pin: rpi:None\n"));
+    let before = card.snapshot();
+    let told = card.added(&["relay", "--yes"]);
+    assert!(told.contains("Nothing is left to change."), "{told}");
+    assert_eq!(card.snapshot(), before);
+    let told = card.added(&["adxl345", "--yes"]);
+    assert!(told.contains(&format!("[adxl345] is in /{PRINTER} already, and stays as it is.")), "{told}");
+    assert!(!Path::new(&card.path(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"))).exists());
+    let told = card.added(&["light", "--yes"]);
+    assert!(told.contains("+ pin: rpi:GPIO17"), "the MCU's own name: {told}");
+    card.added(&["light", "--undo", "--yes"]);
+    card.added(&["adxl345", "--undo", "--yes"]);
+    assert_eq!(card.snapshot(), before);
+}
