@@ -379,8 +379,13 @@ fn inside(root: &Path, path: &Path) -> PathBuf {
 /// Whether a process has the master end of the terminal open, as Pinion itself. The `tty-index` in the fdinfo of a
 /// master names its terminal (proc_pid_fdinfo(5)).
 fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
+    let process = proc.join(pid.to_string());
+    // A container has terminals of its own, with the same numbers.
+    if fs::metadata(process.join("root/dev/pts")).is_ok_and(|devpts| devpts.dev() != terminal.devpts) {
+        return false;
+    }
     let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.number));
-    let Ok(files) = fs::read_dir(proc.join(pid.to_string()).join("fdinfo")) else { return false };
+    let Ok(files) = fs::read_dir(process.join("fdinfo")) else { return false };
     let files = files.flatten().take(OPEN_FILES_MAX);
     let mut told = files.filter_map(|file| foreign::read(&file.path(), PROC_BYTES_MAX).ok());
     told.any(|info| info.split(|byte| *byte == b'\n').any(|line| line == index.as_bytes()))
@@ -494,6 +499,24 @@ mod tests {
         assert_eq!(look(file.path()).unwrap(), Search::Nobody);
         host.kill().unwrap();
         host.wait().unwrap();
+    }
+
+    #[test]
+    fn a_terminal_of_the_same_number_in_a_container_is_served_by_another() {
+        let (_pty, device) = terminal();
+        let terminal = Terminal::of(&device).unwrap();
+        let proc = tempfile::tempdir().unwrap();
+        let process = proc.path().join("7");
+        fs::create_dir_all(process.join("fdinfo")).unwrap();
+        let info = format!("pos:\t0\ntty-index:\t{}\n", nix::sys::stat::minor(terminal.number));
+        fs::write(process.join("fdinfo/3"), info).unwrap();
+        assert!(serves(proc.path(), 7, terminal));
+        fs::create_dir_all(process.join("root/dev")).unwrap();
+        std::os::unix::fs::symlink("/dev/pts", process.join("root/dev/pts")).unwrap();
+        assert!(serves(proc.path(), 7, terminal), "it has the same terminals");
+        fs::remove_file(process.join("root/dev/pts")).unwrap();
+        fs::create_dir(process.join("root/dev/pts")).unwrap();
+        assert!(!serves(proc.path(), 7, terminal));
     }
 
     /// A folder like /proc, with a process of this user and this group that has these files open.
