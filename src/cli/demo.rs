@@ -505,7 +505,7 @@ mod tests {
     #[test]
     fn the_rate_is_that_since_the_sight_before() {
         let sight = |ticks, position| Sight { clock: Clock::from_ticks(ticks), position, triggered: false };
-        assert_eq!(rate(sight(0, 0), sight(1_000_000, -40), 50e6), -2000.0);
-        assert_eq!(rate(sight(1_000_000, -40), sight(1_000_000, -40), 50e6), 0.0);
+        assert_eq!(rate(sight(0, 0), sight(500, -40), 1000.0), -80.0);
+        assert_eq!(rate(sight(500, -40), sight(500, -40), 1000.0), 0.0);
     }
 }
