@@ -37,7 +37,7 @@ const DRAW_PERIOD: Duration = Duration::from_millis(100);
 const LOOK_PERIOD: Duration = Duration::from_millis(200);
 /// How long the program's end waits for a terminal that takes no output.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// Most letters of a name that has the others' column moved.
+/// Longest name that stays in its column.
 const HEAD_MAX: usize = 20;
 /// Rows of a terminal that the log keeps.
 const LOG_ROWS: usize = 3;

@@ -38,7 +38,7 @@ const ANSWER_TIME: Duration = Duration::from_secs(5);
 /// How long what a client still sends is read after an answer, and how much of it.
 const FAREWELL_TIME: Duration = Duration::from_millis(500);
 const FAREWELL_MAX: usize = 256 * 1024;
-/// How much the kernel keeps for a slow viewer: some frames. With more, it would see what was long ago.
+/// How much the kernel keeps for a slow viewer: some frames. A larger buffer would show old pictures.
 const SEND_BUFFER: usize = 128 * 1024;
 /// How long to wait if the computer has no room for a further connection.
 const PAUSE: Duration = Duration::from_millis(100);

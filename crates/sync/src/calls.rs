@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a thread needs to know of another one, to call it only if it sleeps, and to sleep only if nothing is there.
+//! Sleep flags: a thread wakes another only if it sleeps, and sleeps only if it has no work.
 
 use crate::atomic::{AtomicBool, AtomicU32, Ordering, fence};
 

@@ -9,7 +9,7 @@ use crate::atomic::{AtomicU32, Ordering};
 const BEAT_AT: usize = 0;
 /// How long it may stay the last one.
 const SILENCE_MAX_MS: usize = 1;
-/// Whether a debt stops the heart.
+/// Whether a pending shutdown value stops the heartbeat.
 const OWES: usize = 2;
 /// The name of the debt: a text.
 const SUBJECT: usize = 3;

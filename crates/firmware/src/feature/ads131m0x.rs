@@ -204,7 +204,7 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
         if !(1..=CHANNELS_MAX as u8).contains(&sensor_channel_count) {
             return Err(Shutdown::by_host(
                 INVALID_CHANNEL_COUNT,
-                format_args!("a chip with {sensor_channel_count} channels is none of 1 to {CHANNELS_MAX}"),
+                format_args!("{sensor_channel_count} channels is outside 1 to {CHANNELS_MAX}"),
             ));
         }
         if channel_mask == 0 || channel_mask >> sensor_channel_count != 0 {

@@ -159,7 +159,7 @@ impl Spi {
     /// Checks that the device may get a bus, with this mode.
     fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
         if mode > 3 {
-            return Err(invalid(format_args!("mode {mode} is none of 0 to 3")));
+            return Err(invalid(format_args!("mode {mode} is outside 0 to 3")));
         }
         if self.bus.is_some() {
             return Err(invalid("it has a bus already"));

@@ -175,9 +175,8 @@ pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err
 
 /// The shutdown that `emergency_stop` causes.
 pub fn emergency() -> Shutdown {
-    let cause = "the host asked for it, by FIRMWARE_RESTART, M112 or an error of its own (its log tells which)";
-    Shutdown::because(reason::COMMAND_REQUEST, cause)
-        .remedy("unless it was FIRMWARE_RESTART, deal with the cause, then FIRMWARE_RESTART")
+    Shutdown::because(reason::COMMAND_REQUEST, "the host asked for it (FIRMWARE_RESTART, M112 or an error)")
+        .remedy("see klippy.log for the cause, then FIRMWARE_RESTART")
 }
 
 const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu| mcu.clear_shutdown()).allowed_in_shutdown();

@@ -57,7 +57,10 @@ fn why_it_stopped_comes_with_what_helps() {
     rig.send("emergency_stop");
     // A FIRMWARE_RESTART begins this way.
     let detail = tell(&rig).detail.to_string();
-    assert!(detail.starts_with("the host asked for it, by FIRMWARE_RESTART, M112 or"), "{detail}");
+    assert!(
+        detail.starts_with("the host asked for it (FIRMWARE_RESTART, M112 or an error): see klippy.log"),
+        "{detail}"
+    );
     let mut rig = Rig::configured(&["config_counter oid=0 pin=5 pull_up=0"]);
     rig.send("query_counter oid=0 clock=@1000 poll_ticks=0 sample_ticks=1000");
     rig.run_until(2000);

@@ -98,7 +98,7 @@ fn no_edges(code: i32) -> Box<str> {
     let why = match code {
         libc::ENXIO => "its chip has no interrupts".to_owned(),
         libc::EBUSY => "its interrupt is in use".to_owned(),
-        libc::EINVAL | libc::ENOTTY => "Linux before 5.10 does so for no line, and some drivers for none".to_owned(),
+        libc::EINVAL | libc::ENOTTY => "this needs Linux 5.10 and a driver that supports it".to_owned(),
         _ => text(code),
     };
     format!("the kernel does not tell of its edges ({why})").into()

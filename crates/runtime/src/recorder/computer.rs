@@ -102,7 +102,7 @@ impl Computer {
     fn look_at_all(&mut self, at: Clock) {
         self.look_at_stolen_time(at);
         let power = self.power_fault();
-        // What lasts is told each time, as the ring forgets.
+        // Repeat conditions that last: the ring overwrites old events.
         if power != self.power || power.is_some() {
             self.power = power;
             self.writer.write(at, Event::Power(power));

@@ -106,7 +106,7 @@ impl Part for Hx71xConfig {
 
     fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         if !self.chip.rates().contains(&self.samples_per_s) {
-            let cause = format!("{} is none of the chip's rates", self.samples_per_s);
+            let cause = format!("{} is not a rate of the chip", self.samples_per_s);
             return wrong(whose, "samples_per_s", &cause, &format!("give one of {:?}", self.chip.rates()));
         }
         for (key, pin) in self.pins() {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What is made of a recorded path: files for people and programs, and a comparison with the G-code that asked for it.
+//! Exports of a recorded path, and a comparison with the G-code that asked for it.
 
 #![forbid(unsafe_code)]
 

@@ -38,7 +38,7 @@ fn common(a: Span, b: Span) -> i64 {
 pub(super) struct Account {
     pub(super) ran: i64,
     pub(super) waited: i64,
-    /// How long it neither ran, nor waited, nor slept as it wished; `None` if the record does not reach back so far.
+    /// Time that is neither run, wait nor intended sleep; `None` if the record does not reach back so far.
     pub(super) lost: Option<i64>,
 }
 
