@@ -5,6 +5,8 @@
 CARGO ?= $(shell command -v cargo || echo "$$HOME/.cargo/bin/cargo")
 CARGO_TARGET_DIR ?= target
 PINION = $(CARGO_TARGET_DIR)/release/pinion
+# Beside it: the simulated printer.
+PINION_SIM = $(dir $(PINION))pinion-sim
 # Options for `pinion sim`, such as ARGS="-I /tmp/klipper_host_sim".
 ARGS ?=
 # Root may run in real time: what else the computer does then delays no step.
@@ -35,7 +37,7 @@ export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
 .PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package test-bare soak soak-real fuzz coverage mutants
-.PHONY: sanitize bench check build install install-program install-system uninstall deb release clean
+.PHONY: sanitize bench check build install install-program install-sim install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
 PACKAGES = $(addprefix system-packages-,build mainsail vm deb system stress check fuzz coverage)
@@ -63,7 +65,7 @@ help:
 	@echo 'make sanitize      what threads share, in all orders; tests with sanitizers'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
-	@echo 'make build         the program: $(PINION)'
+	@echo 'make build         the programs: $(PINION) and pinion-sim'
 	@echo 'make install       program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
 	@echo 'make deb           a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
 	@echo '                   in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
@@ -82,7 +84,7 @@ mainsail: system-packages-mainsail build
 	@PINION='$(PINION)' scripts/mainsail '$(FOLDER)'
 
 build: system-packages-build
-	@'$(CARGO)' build --release --locked --quiet --bin pinion
+	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-simulator
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
@@ -168,12 +170,13 @@ check: system-packages-check
 	'$(CARGO)' doc --locked --no-deps --document-private-items --quiet $$small
 	@# The program of the tests: one built for itself would have other features of some crates.
 	'$(CARGO)' test --locked --quiet --no-run
+	'$(CARGO)' build --locked --quiet --package pinion-simulator
 	CARGO='$(CARGO)' scripts/check-dependencies
 	scripts/check-man '$(CARGO_TARGET_DIR)/debug/pinion'
 	scripts/check-deb '$(CARGO_TARGET_DIR)/debug/pinion'
 
 # Root installs what was built before: no compiler runs as root.
-install: install-program install-system
+install: install-program install-sim install-system
 
 install-program:
 	@test -x '$(PINION)' || { echo 'There is nothing to install yet: run make build first.' >&2; exit 1; }
@@ -188,6 +191,16 @@ install-program:
 	'$(COMPLETER)' completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion
 	'$(COMPLETER)' completions fish >$(DESTDIR)$(FISHDIR)/pinion.fish
 	chmod 644 $(DESTDIR)$(BASHDIR)/pinion $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish
+
+# The simulated printer, for computers without pins, too.
+install-sim:
+	install -D -m 755 '$(PINION_SIM)' $(DESTDIR)$(PREFIX)/bin/pinion-sim
+	install -D -m 644 man/pinion-sim.1 $(DESTDIR)$(MANDIR)/man1/pinion-sim.1
+	install -d $(DESTDIR)$(BASHDIR) $(DESTDIR)$(ZSHDIR) $(DESTDIR)$(FISHDIR)
+	'$(COMPLETER)' sim completions bash >$(DESTDIR)$(BASHDIR)/pinion-sim
+	'$(COMPLETER)' sim completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion-sim
+	'$(COMPLETER)' sim completions fish >$(DESTDIR)$(FISHDIR)/pinion-sim.fish
+	chmod 644 $(DESTDIR)$(BASHDIR)/pinion-sim $(DESTDIR)$(ZSHDIR)/_pinion-sim $(DESTDIR)$(FISHDIR)/pinion-sim.fish
 
 install-system:
 	install -d $(DESTDIR)$(UNITDIR)
@@ -219,7 +232,9 @@ ifeq ($(DESTDIR),)
 	    systemctl disable --now $$unit; \
 	done
 endif
-	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
+	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(PREFIX)/bin/pinion-sim $(DESTDIR)$(MANDIR)/man1/pinion-sim.1 \
+	    $(DESTDIR)$(BASHDIR)/pinion-sim $(DESTDIR)$(ZSHDIR)/_pinion-sim $(DESTDIR)$(FISHDIR)/pinion-sim.fish \
+	    $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
 	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(UNITDIR)/pinion-usb-gadget.service \
 	    $(DESTDIR)$(USERUNITDIR)/pinion-link@.service \
 	    $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(LIBDIR)/usb-gadget $(DESTDIR)$(BASHDIR)/pinion \

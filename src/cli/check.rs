@@ -30,14 +30,15 @@ use super::computer::manager::{SYSTEMCTL, watchdog_of_systemd};
 use super::finding::{self, Finding, Group, Level};
 use super::quietly;
 use super::settings::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
+use super::simulator::Open;
 
 /// Checks, and prints the findings. `file` is the configuration file, which has been read.
-pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
+pub(super) fn run(settings: &Settings, file: Option<&Path>, simulated: Open) -> ExitCode {
     let mut findings = Vec::new();
     if let Some(file) = file {
         findings.push(Finding::ok("config", format!("{} can be read", file.display())));
     }
-    findings.extend(board(settings));
+    findings.extend(board(settings, simulated));
     match &settings.link {
         LinkName::Pty(symlink) => {
             findings.push(link(symlink));
@@ -55,7 +56,7 @@ pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
 }
 
 /// Whether the board opens, its devices may be opened, and the dialect can be made from its pins.
-fn board(settings: &Settings) -> Vec<Finding> {
+fn board(settings: &Settings, simulated: Open) -> Vec<Finding> {
     let mut findings = Vec::new();
     if settings.board == BoardName::Linux {
         // The board would log these problems, and serve the rest.
@@ -64,7 +65,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
         findings.extend(fast_gpio(settings.fast_gpio, &chips));
     }
     // Its problems are among the findings already.
-    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off));
+    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), simulated));
     let board = match board {
         Ok((board, _)) => board,
         Err(error) => {

@@ -38,13 +38,13 @@ use pinion_linux::own_folder::OwnFolder;
 use pinion_runtime::klippy::process::{Process, Search, Terminal as Device, find};
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
-use pinion_sim::SimBoard;
 use pinion_trace::folder::user_state;
 
 use super::complete::{SIMULATED, offering};
 use super::files;
 use super::page::{Page, print};
-use super::settings::{BoardName, sim_config};
+use super::settings::BoardName;
+use super::simulator::Open;
 use super::terminal::{Terminal, give_back_at, off};
 use super::{failed, logging, not_permitted};
 
@@ -64,7 +64,7 @@ const PROMPT: &str = "> ";
 
 /// Options of `pinion console`.
 #[derive(Args, Clone, Debug)]
-pub(super) struct ConsoleArgs {
+pub struct ConsoleArgs {
     /// The MCU's terminal
     #[arg(value_name = "PTY", default_value = "/tmp/klipper_host_mcu")]
     pty: PathBuf,
@@ -77,8 +77,8 @@ pub(super) struct ConsoleArgs {
     board: Option<BoardName>,
 }
 
-/// Talks to an MCU until there are no more lines.
-pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
+/// Talks to an MCU until there are no more lines. A simulated board is made by `simulated`.
+pub fn run(args: &ConsoleArgs, simulated: Open) -> ExitCode {
     let done = match &args.board {
         None => {
             let ready = free(&args.pty).and_then(|()| {
@@ -88,7 +88,7 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
             });
             ready.and_then(|_terminal| speak(args, &args.pty))
         }
-        Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
+        Some(BoardName::Sim(file)) => simulate(args, file.as_deref(), simulated),
         Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this computer's pins start pinion run, then give pinion console its link".into()),
     };
     done.map_or_else(failed, |()| ExitCode::SUCCESS)
@@ -144,7 +144,10 @@ fn names(processes: &[Process]) -> String {
 }
 
 /// Runs a simulated MCU, and talks to it.
-fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
+fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<(), String> {
+    // This comes first, because another program may take over for it.
+    let clock = Monotonic::start();
+    let (board, timing) = simulated(file, Arc::new(clock)).map_err(|error| error.to_string())?;
     // The only host is this console, and it speaks every dialect.
     let helpers = Helpers::default();
     // The other signals end the MCU in order. Then `signal` says which one it was.
@@ -158,9 +161,6 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     // The lines about each event are for a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
     logging::detach();
-    let clock = Monotonic::start();
-    let board = sim_config(file).and_then(|config| SimBoard::new(config, Arc::new(clock)));
-    let board = board.map_err(|error| error.to_string())?;
     let symlink = std::env::temp_dir().join(format!("pinion_console_{}", std::process::id()));
     let recording = Recording::new(clock, &symlink, false, Vec::new()).map_err(|error| error.to_string())?;
     let options = Options {
@@ -196,8 +196,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
             }
         }
     };
-    let timing = board.timing();
-    let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, ready);
+    let ended = pinion_runtime::run(&options, board, timing, recording, helpers, ready);
     drop(terminal);
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();

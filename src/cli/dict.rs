@@ -12,7 +12,6 @@ use clap::Args;
 
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::clock::Monotonic;
-use pinion_linux::gpio::FastGpio;
 use pinion_runtime::FIRMWARE;
 
 use super::complete::{BOARDS, DIALECTS, offering};
@@ -20,10 +19,11 @@ use super::failed;
 use super::files::Output;
 use super::page::{Page, print};
 use super::settings::BoardName;
+use super::simulator::Open;
 
 /// Options of `pinion dict`.
 #[derive(Args, Clone, Debug)]
-pub(super) struct DictArgs {
+pub struct DictArgs {
     /// Write to FILE instead of stdout
     #[arg(short = 'o', value_name = "FILE")]
     output: Option<PathBuf>,
@@ -38,20 +38,19 @@ pub(super) struct DictArgs {
     dialect: DialectName,
 }
 
-/// Prints the dictionary as JSON.
-pub(super) fn run(args: &DictArgs) -> ExitCode {
-    put(args).map_or_else(failed, |()| ExitCode::SUCCESS)
+/// Prints the dictionary as JSON. A simulated board is made by `simulated`.
+pub fn run(args: &DictArgs, simulated: Open) -> ExitCode {
+    put(args, simulated).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
-fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
-    let (board, _) =
-        args.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off).map_err(|trouble| trouble.to_string())?;
+fn dictionary(args: &DictArgs, simulated: Open) -> Result<Vec<u8>, String> {
+    let (board, _) = args.board.open(Arc::new(Monotonic::start()), simulated).map_err(|trouble| trouble.to_string())?;
     let dialect = Dialect::new(&FIRMWARE, &*board, args.dialect).map_err(|error| error.to_string())?;
     dialect.dictionary().json().map_err(|error| error.to_string())
 }
 
-fn put(args: &DictArgs) -> Result<(), String> {
-    let json = dictionary(args)?;
+fn put(args: &DictArgs, simulated: Open) -> Result<(), String> {
+    let json = dictionary(args, simulated)?;
     match &args.output {
         Some(path) => Output::check(path, &args.board.files())?.write(|out| out.write_all(&json)),
         None => print(&Page::json(&String::from_utf8_lossy(&json))),

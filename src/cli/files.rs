@@ -26,7 +26,7 @@ const TRIES: u32 = 100;
 /// # Errors
 ///
 /// The errors of [`foreign::open`]. [`io::ErrorKind::FileTooLarge`]: it is longer.
-pub(super) fn open(path: &Path, mib_max: u64) -> io::Result<impl Read> {
+pub fn open(path: &Path, mib_max: u64) -> io::Result<impl Read> {
     let (file, about) = foreign::open(path)?;
     if about.len() > mib_max * MIB {
         return Err(io::Error::new(io::ErrorKind::FileTooLarge, format!("it is longer than {mib_max} MiB")));
@@ -40,14 +40,14 @@ pub(super) fn open(path: &Path, mib_max: u64) -> io::Result<impl Read> {
 /// # Errors
 ///
 /// The errors of [`open`] and of reading.
-pub(super) fn read(path: &Path, mib_max: u64) -> io::Result<Vec<u8>> {
+pub fn read(path: &Path, mib_max: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path, mib_max)?.read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 
 /// A file to write. There is none until it is written.
-pub(super) struct Output {
+pub struct Output {
     /// As the command line names it.
     path: PathBuf,
     /// The same, without symbolic links.
@@ -61,7 +61,7 @@ impl Output {
     /// # Errors
     ///
     /// One line with the file, the cause and the remedy.
-    pub(super) fn check(path: &Path, inputs: &[&Path]) -> Result<Output, String> {
+    pub fn check(path: &Path, inputs: &[&Path]) -> Result<Output, String> {
         let (place, there) = Output::find(path).map_err(|error| unwritable(path, &error))?;
         let is_there = |input: &&&Path| match (&there, fs::metadata(input)) {
             (Some(there), Ok(input)) => (there.dev(), there.ino()) == (input.dev(), input.ino()),
@@ -91,7 +91,7 @@ impl Output {
     /// # Errors
     ///
     /// One line with the file, the cause and the remedy.
-    pub(super) fn write<T>(&self, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<T>) -> Result<T, String> {
+    pub fn write<T>(&self, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<T>) -> Result<T, String> {
         let failed = |error: io::Error| unwritable(&self.path, &error);
         let (fresh, file) = beside(&self.place).map_err(failed)?;
         let put = || {
@@ -116,13 +116,14 @@ impl Output {
     /// # Errors
     ///
     /// One line with the file, the cause and the remedy.
-    pub(super) fn make(&self) -> Result<File, String> {
+    pub fn make(&self) -> Result<File, String> {
         let mut options = OpenOptions::new();
         options.write(true).create(true).truncate(true).custom_flags(OFlag::O_NONBLOCK.bits());
         options.open(&self.place).map_err(|error| unwritable(&self.path, &error))
     }
 
-    pub(super) fn path(&self) -> impl Display {
+    /// The file, as the command line names it.
+    pub fn path(&self) -> impl Display {
         self.path.display()
     }
 }

@@ -136,8 +136,8 @@ fn plural(count: usize) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::assert_plain;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
 
     fn groups() -> Vec<Group> {

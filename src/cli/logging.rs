@@ -276,7 +276,7 @@ fn put(line: &str, patience: PollTimeout) {
 }
 
 /// Turns the log on, for lines at `level` or graver.
-pub(super) fn start(level: LevelFilter) {
+pub fn start(level: LevelFilter) {
     // This fails if another logger is set already, for example by a test. That one stays.
     let _ = log::set_logger(&STDERR);
     log::set_max_level(level);
@@ -284,7 +284,7 @@ pub(super) fn start(level: LevelFilter) {
 
 /// Starts the thread that writes, so that no other thread waits for a reader of stderr. Call it after the guardian is
 /// forked, because a process with threads cannot be forked.
-pub(super) fn detach() {
+pub fn detach() {
     match started(thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on())) {
         Ok(_) => STDERR.queue().has_writer = true,
         Err(trouble) => log::warn!("a log that nobody reads will stop Pinion: {trouble}"),
@@ -292,7 +292,7 @@ pub(super) fn detach() {
 }
 
 /// Waits up to a second until the queue is written. Later lines are written at once.
-pub(super) fn finish() {
+pub fn finish() {
     let mut queue = STDERR.queue();
     if queue.has_writer {
         queue.report(STDERR.style(), Duration::MAX);
@@ -306,8 +306,8 @@ pub(super) fn finish() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::assert_plain;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
 
     #[test]

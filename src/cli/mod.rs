@@ -9,7 +9,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 use std::process::ExitCode;
 
-use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueHint};
 use log::LevelFilter;
 
 use complete::{LEVELS, offering};
@@ -20,32 +20,29 @@ mod add;
 mod attach;
 #[cfg(test)]
 mod boards;
-mod camera;
 mod check;
 mod complete;
 mod computer;
 mod config;
-mod console;
-pub mod demo;
-mod dict;
+pub mod console;
+pub mod dict;
 mod doctor;
-mod files;
+pub mod files;
 mod finding;
-pub mod latency;
+mod latency;
 mod link;
-mod logging;
-mod own_status;
-mod page;
-pub mod pins;
+pub mod logging;
+pub mod page;
+mod pins;
 pub mod run;
 mod settings;
-mod show;
-pub mod sim;
-mod status;
-mod terminal;
+pub mod simulator;
+pub mod status;
+pub mod terminal;
 mod trace;
 
 use page::{Page, print};
+use simulator::take_over;
 
 /// What the targets in `fuzz/` call.
 #[cfg(fuzzing)]
@@ -71,11 +68,18 @@ pub(crate) struct Cli {
 
 /// What goes to the log (stderr).
 #[derive(Args, Debug, Clone)]
-struct LogArgs {
+pub struct LogArgs {
     /// How much to log: error, warn, info, debug, trace or off [default: info]
     #[arg(long, value_name = "LEVEL", global = true, value_parser = offering::<LevelFilter>(LEVELS),
         hide_possible_values = true)]
-    log_level: Option<LevelFilter>,
+    pub log_level: Option<LevelFilter>,
+}
+
+impl LogArgs {
+    /// The level, or the default one.
+    pub fn level(&self) -> LevelFilter {
+        self.log_level.unwrap_or(LevelFilter::Info)
+    }
 }
 
 #[derive(Subcommand, Debug)]
@@ -103,7 +107,12 @@ enum Command {
     /// The far end of `pinion link`: carry standard input and output to the running Pinion
     Attach(attach::AttachArgs),
     /// Show the simulated printer at work, or print its printer.cfg
-    Sim(sim::SimArgs),
+    #[command(disable_help_flag = true)]
+    Sim {
+        /// Options and files of pinion-sim: see `pinion sim --help`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT", value_hint = ValueHint::FilePath)]
+        arguments: Vec<OsString>,
+    },
     /// Print a script with which a shell completes pinion's command lines
     Completions {
         /// The shell
@@ -114,22 +123,22 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    logging::start(cli.log.log_level.unwrap_or(LevelFilter::Info));
+    logging::start(cli.log.level());
     let status = match cli.command {
-        None => run::run(&cli.run, cli.log.log_level),
-        Some(Command::Run(args)) => run::run(&args, cli.log.log_level),
+        None => run::run(&cli.run, cli.log.log_level, take_over),
+        Some(Command::Run(args)) => run::run(&args, cli.log.log_level, take_over),
         Some(Command::Add(args)) => add::run(&args),
         Some(Command::Pins(args)) => pins::run(&args),
-        Some(Command::Dict(args)) => dict::run(&args),
+        Some(Command::Dict(args)) => dict::run(&args, take_over),
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Status(args)) => status::run(&args),
         Some(Command::Trace(args)) => trace::run(&args),
-        Some(Command::Console(args)) => console::run(&args),
+        Some(Command::Console(args)) => console::run(&args, take_over),
         Some(Command::Link(args)) => link::run(&args),
         Some(Command::Attach(args)) => attach::run(&args),
-        Some(Command::Sim(args)) => sim::run(&args),
-        Some(Command::Completions { shell }) => completions(shell),
+        Some(Command::Sim { arguments }) => sim(&arguments, &cli.log),
+        Some(Command::Completions { shell }) => completions(&mut Cli::command(), shell),
     };
     logging::finish();
     status
@@ -146,10 +155,17 @@ fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run:
     })
 }
 
+/// Does the work of `pinion sim` in another program.
+fn sim(arguments: &[OsString], log: &LogArgs) -> ExitCode {
+    let level = log.log_level.map(|level| format!("--log-level={level}").into());
+    failed(simulator::start(&level.into_iter().chain(arguments.iter().cloned()).collect::<Vec<_>>()))
+}
+
 /// Prints the script for a shell.
-fn completions(shell: clap_complete::Shell) -> ExitCode {
+pub fn completions(program: &mut clap::Command, shell: clap_complete::Shell) -> ExitCode {
     let mut script = Vec::new();
-    clap_complete::generate(shell, &mut Cli::command(), "pinion", &mut script);
+    let name = program.get_name().to_owned();
+    clap_complete::generate(shell, program, name, &mut script);
     match print(&Page::text(&String::from_utf8_lossy(&script))) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -191,7 +207,7 @@ fn not_permitted(link: &Path, file: &Path) -> String {
 }
 
 /// Logs why a subcommand failed, and returns its exit status.
-fn failed(error: impl std::fmt::Display) -> ExitCode {
+pub fn failed(error: impl std::fmt::Display) -> ExitCode {
     log::error!("{error}");
     ExitCode::FAILURE
 }

@@ -13,29 +13,29 @@ use pinion_linux::foreign::{plain, plain_json};
 
 /// Lines, each with its line feed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Page(String);
+pub struct Page(String);
 
 impl Page {
     /// A text whose line feeds are ours.
-    pub(super) fn text(text: &str) -> Page {
+    pub fn text(text: &str) -> Page {
         let mut page = Page::default();
         text.lines().for_each(|line| page.line(line));
         page
     }
 
     /// JSON as serde_json writes it: it escapes the line feeds that are not its own.
-    pub(super) fn json(json: &str) -> Page {
+    pub fn json(json: &str) -> Page {
         Page(plain_json(json))
     }
 
     /// Adds a line.
-    pub(super) fn line(&mut self, line: impl Display) {
+    pub fn line(&mut self, line: impl Display) {
         // A String takes everything that is written to it.
         let _ = writeln!(self.0, "{}", plain(&line.to_string()));
     }
 
     /// Adds the lines of another page.
-    pub(super) fn append(&mut self, other: &Page) {
+    pub fn append(&mut self, other: &Page) {
         self.0 += &other.0;
     }
 
@@ -43,7 +43,8 @@ impl Page {
         self.0.is_empty()
     }
 
-    pub(super) fn lines(&self) -> impl Iterator<Item = &str> {
+    /// The lines, without their line feeds.
+    pub fn lines(&self) -> impl Iterator<Item = &str> {
         self.0.lines()
     }
 }
@@ -55,7 +56,7 @@ impl Display for Page {
 }
 
 /// The rows of a table as lines: each column is as wide as its widest cell, with two spaces between columns.
-pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
+pub fn aligned(rows: &[Vec<String>]) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
     let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
@@ -71,7 +72,7 @@ pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
 
 /// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program continues with its other
 /// work.
-pub(super) fn print(page: &Page) -> Result<(), String> {
+pub fn print(page: &Page) -> Result<(), String> {
     match draw(&page.0) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout cannot be written: {error}")),
         _ => Ok(()),
@@ -79,26 +80,17 @@ pub(super) fn print(page: &Page) -> Result<(), String> {
 }
 
 /// Writes text on stdout that moves the cursor and paints. The names in it come from a page or from [`plain`].
-pub(super) fn draw(text: &str) -> io::Result<()> {
+pub fn draw(text: &str) -> io::Result<()> {
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes())?;
     out.flush()
 }
 
 #[cfg(test)]
-pub(in crate::cli) mod tests {
+mod tests {
     use super::*;
-    use pinion_linux::foreign::is_unseen;
-    use pinion_testkit::names::any_name;
+    use pinion_testkit::names::{any_name, assert_plain};
     use proptest::prelude::*;
-
-    /// Asserts that only lines leave a printer, and no more of them than with harmless names.
-    #[track_caller]
-    pub(in crate::cli) fn assert_plain(text: &str, lines: usize) {
-        let unseen = text.chars().find(|c| is_unseen(*c) && *c != '\n');
-        assert_eq!(unseen, None, "{text:?}");
-        assert_eq!(text.matches('\n').count(), lines, "{text:?}");
-    }
 
     #[test]
     fn a_table_has_room_for_the_longest_cell() {

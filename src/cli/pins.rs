@@ -563,12 +563,12 @@ fn serial_section(ports: &[SerialEntry]) -> Page {
 mod tests {
     use super::*;
     use crate::cli::boards::{self, Board};
-    use crate::cli::page::tests::assert_plain;
     use pinion_linux::adc::{Channel, Format};
     use pinion_linux::gpio::LineInfo;
     use pinion_linux::pwm;
     use pinion_linux::sysfs::PwmChannel;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
     use serde_json::{Value, json};
 

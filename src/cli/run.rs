@@ -18,14 +18,15 @@ use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Guardian, Helpers, Options, Recording};
 use pinion_trace::folder::folders;
 
-use super::settings::{BoardName, Given, Settings, WATCHDOG};
+use super::settings::{BoardName, Given, Settings, WATCHDOG, linux};
+use super::simulator::Open;
 use super::{check, config, end_by_panic, failed, logging};
 
 /// Options of `pinion run`, and of `pinion` alone.
 #[derive(Args, Clone, Debug)]
 // An option may stand both in the unit and in PINION_OPTIONS. The last one counts.
 #[command(args_override_self = true)]
-pub(super) struct RunArgs {
+pub struct RunArgs {
     #[command(flatten)]
     given: Given,
     /// Read options from FILE, for example /etc/pinion/pinion.toml. The command line overrides it
@@ -71,20 +72,28 @@ impl RunArgs {
     }
 }
 
-/// Serves until SIGTERM, SIGINT or SIGHUP. With `--check` it only tells whether that is possible.
-pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
+/// Serves until SIGTERM, SIGINT or SIGHUP. With `--check` it only tells whether that is possible. A simulated board is made
+/// by `simulated`. `log_level` is the command line's.
+pub fn run(args: &RunArgs, log_level: Option<LevelFilter>, simulated: Open) -> ExitCode {
     let settings = match args.settings(log_level) {
         Ok(settings) => settings,
         Err(error) => return failed(error),
     };
     log::set_max_level(settings.log_level);
     if args.check {
-        return check::run(&settings, args.config.as_deref());
+        return check::run(&settings, args.config.as_deref(), simulated);
     }
     end_by_panic();
     let clock = Monotonic::start();
-    // A simulated printer needs no guardian.
-    let guarded = settings.board == BoardName::Linux;
+    // A simulated printer needs no guardian. It comes first, because another program may take over for it.
+    let simulation = match &settings.board {
+        BoardName::Linux => None,
+        BoardName::Sim(file) => match simulated(file.as_deref(), Arc::new(clock)) {
+            Ok(opened) => Some(opened),
+            Err(error) => return failed(error),
+        },
+    };
+    let guarded = simulation.is_none();
     let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders())
         .map(|recording| recording.over(&settings.link));
     // /dev/mem is opened later, when a line of its chip is claimed.
@@ -104,10 +113,7 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
         log::info!("configuration {}", file.display());
     }
     let guard = helpers.guardian.as_ref().map(Guardian::guard);
-    let (board, timing) = match settings.board.open(Arc::new(clock), guard, settings.fast_gpio) {
-        Ok(opened) => opened,
-        Err(error) => return failed(error),
-    };
+    let (board, timing) = simulation.unwrap_or_else(|| linux(Arc::new(clock), guard, settings.fast_gpio));
     match pinion_runtime::run(&settings.options(), board, timing, recording, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),

@@ -17,18 +17,15 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::gpio::FastGpio;
 use pinion_linux::{Guard, LinuxBoard};
 use pinion_runtime::{Access, LinkName};
-use pinion_sim::{SimBoard, SimConfig};
 
 use super::complete::{BOARDS, FAST, SPOKEN, offering};
-use super::files;
+use super::simulator::Open;
 
 /// The device of the watchdog that -w feeds.
 pub(super) const WATCHDOG: &str = "/dev/watchdog";
 /// The remedy if the device is missing.
 pub(super) const WATCHDOG_REMEDY: &str =
     "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
-/// Longest description of a simulated printer.
-const DESCRIPTION_MIB: u64 = 1;
 /// Highest margin that may be asked for.
 pub(super) const MARGIN_MAX_US: u32 = 10_000;
 
@@ -201,33 +198,24 @@ impl BoardName {
         }
     }
 
-    /// Opens the board. Its outputs are given to `guard`. The timing is for its MCU. `fast_gpio` is for the computer's
-    /// pins.
+    /// Opens the board, a simulated one by `simulated`, to see what it has. The timing is for its MCU.
     pub(super) fn open(
         &self,
         clock: Arc<dyn TimeSource>,
-        guard: Option<Box<dyn Guard>>,
-        fast_gpio: FastGpio,
+        simulated: Open,
     ) -> Result<(Box<dyn Board>, Timing), Trouble> {
         match self {
-            BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard, fast_gpio)), Timing::of(clock))),
-            BoardName::Sim(file) => {
-                let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock))?;
-                let timing = board.timing();
-                Ok((Box::new(board), timing))
-            }
+            BoardName::Linux => Ok(linux(clock, None, FastGpio::Off)),
+            BoardName::Sim(file) => simulated(file.as_deref(), clock),
         }
     }
 }
 
-/// The description of a simulated printer: from a file, or the default one.
-pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, Trouble> {
-    let Some(path) = file else { return Ok(SimConfig::default_printer()) };
-    let unreadable = |cause: String| {
-        let trouble = Trouble::new(cause).of(path.display());
-        trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
-    };
-    let bytes = files::read(path, DESCRIPTION_MIB).map_err(|error| unreadable(error.to_string()))?;
-    let text = String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))?;
-    SimConfig::parse(&text, &path.display().to_string())
+/// This computer's pins. Their outputs are given to `guard`. The timing is for the MCU.
+pub(super) fn linux(
+    clock: Arc<dyn TimeSource>,
+    guard: Option<Box<dyn Guard>>,
+    fast_gpio: FastGpio,
+) -> (Box<dyn Board>, Timing) {
+    (Box::new(LinuxBoard::new(guard, fast_gpio)), Timing::of(clock))
 }

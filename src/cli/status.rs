@@ -13,10 +13,13 @@ use pinion_runtime::status::form::Status;
 use super::failed;
 use super::page::{Page, print};
 
-pub(super) mod ask;
+mod ask;
 mod prometheus;
 mod text;
 mod watch;
+
+pub(super) use ask::fetch;
+pub use ask::{Answer, ask_at};
 
 /// Options of `pinion status`.
 #[derive(Args, Clone, Debug)]
@@ -84,8 +87,8 @@ pub fn status(bytes: &[u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::assert_plain;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
     use serde_json::{Value, json};
 

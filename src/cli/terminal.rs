@@ -39,37 +39,38 @@ const LAST_ROW: usize = 999;
 const FIRST: OneBased = OneBased::from_zero_based(0);
 
 /// Erases the rest of a line.
-pub(super) const ERASE_LINE: Csi = Csi::Edit(Edit::EraseInLine(EraseInLine::EraseToEndOfLine));
+pub const ERASE_LINE: Csi = Csi::Edit(Edit::EraseInLine(EraseInLine::EraseToEndOfLine));
 /// Erases the rest of the screen.
-pub(super) const ERASE_BELOW: Csi = Csi::Edit(Edit::EraseInDisplay(EraseInDisplay::EraseToEndOfDisplay));
+pub const ERASE_BELOW: Csi = Csi::Edit(Edit::EraseInDisplay(EraseInDisplay::EraseToEndOfDisplay));
 /// Deletes the cursor's row and all rows below it.
-pub(super) const DELETE_BELOW: Csi = Csi::Edit(Edit::DeleteLine(LAST_ROW as u32));
-/// Save and restore the cursor. Not all terminals know the sequences that termina has for it.
-pub(super) const SAVE_CURSOR: &str = "\x1b7";
-pub(super) const RESTORE_CURSOR: &str = "\x1b8";
+pub const DELETE_BELOW: Csi = Csi::Edit(Edit::DeleteLine(LAST_ROW as u32));
+/// Saves the cursor. Not all terminals know the sequence that termina has for it.
+pub const SAVE_CURSOR: &str = "\x1b7";
+/// Restores the cursor.
+pub const RESTORE_CURSOR: &str = "\x1b8";
 
 /// Switches something on.
-pub(super) fn on(code: DecPrivateModeCode) -> Csi {
+pub fn on(code: DecPrivateModeCode) -> Csi {
     Csi::Mode(Mode::SetDecPrivateMode(DecPrivateMode::Code(code)))
 }
 
 /// Switches something off.
-pub(super) fn off(code: DecPrivateModeCode) -> Csi {
+pub fn off(code: DecPrivateModeCode) -> Csi {
     Csi::Mode(Mode::ResetDecPrivateMode(DecPrivateMode::Code(code)))
 }
 
 /// Moves the cursor to the beginning of a row, counted from 1.
-pub(super) fn to_row(row: usize) -> Csi {
+pub fn to_row(row: usize) -> Csi {
     Csi::Cursor(Cursor::Position { line: row_number(row), col: FIRST })
 }
 
 /// Makes the rows down to this one scroll, and no others.
-pub(super) fn scrolling(bottom: usize) -> Csi {
+pub fn scrolling(bottom: usize) -> Csi {
     Csi::Cursor(Cursor::SetTopAndBottomMargins { top: FIRST, bottom: row_number(bottom) })
 }
 
 /// Makes all rows scroll again, and moves the cursor below everything that is shown.
-pub(super) fn all_scrolls() -> String {
+pub fn all_scrolls() -> String {
     format!("{}{}\n", scrolling(usize::MAX), to_row(LAST_ROW))
 }
 
@@ -79,19 +80,21 @@ fn row_number(row: usize) -> OneBased {
 }
 
 /// Moves the cursor up by this many rows, at least one.
-pub(super) fn up(rows: usize) -> Csi {
+pub fn up(rows: usize) -> Csi {
     Csi::Cursor(Cursor::Up(u32::try_from(rows).unwrap_or(u32::MAX)))
 }
 
 /// The size of a terminal in characters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Size {
-    pub(super) rows: usize,
-    pub(super) columns: usize,
+pub struct Size {
+    /// The number of rows.
+    pub rows: usize,
+    /// The number of columns.
+    pub columns: usize,
 }
 
 /// The size of the terminal on stdout.
-pub(super) fn size() -> Size {
+pub fn size() -> Size {
     terminal_size_of(io::stdout())
         .map_or(VT100, |(Width(columns), Height(rows))| Size { rows: rows.into(), columns: columns.into() })
 }
@@ -151,7 +154,7 @@ fn give_back_at_panic() {
 
 /// Makes these signals give the terminal back, and then end the program as they do by themselves. The program has
 /// `grace` to end in order.
-pub(super) fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), String> {
+pub fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), String> {
     let mut signals = Signals::new(signals).map_err(|error| format!("signals cannot be taken in: {error}"))?;
     let wait = move || {
         for signal in signals.forever() {
@@ -171,7 +174,7 @@ fn is_ours() -> bool {
 
 /// Which keys come to the program one by one, without Enter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Keys {
+pub enum Keys {
     /// All keys.
     All,
     /// All keys except those that the kernel makes signals of, such as Ctrl-C.
@@ -180,7 +183,7 @@ pub(super) enum Keys {
 
 /// A key that was pressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Key {
+pub enum Key {
     /// Its signal ends a program: Ctrl-C and Ctrl-\.
     End,
     /// Its signal stops a program: Ctrl-Z.
@@ -190,7 +193,7 @@ pub(super) enum Key {
 }
 
 /// The terminal on stdin and stdout while the program changes it. When this is dropped, the terminal is as before.
-pub(super) struct Terminal {
+pub struct Terminal {
     /// Its settings before. `None` if no keys are read.
     before: Option<Termios>,
     parser: Parser,
@@ -198,7 +201,7 @@ pub(super) struct Terminal {
 
 impl Terminal {
     /// Takes the terminal. No keys are read if stdin is no terminal, or another program reads from it.
-    pub(super) fn take(keys: Keys) -> Terminal {
+    pub fn take(keys: Keys) -> Terminal {
         give_back_at_panic();
         let stdin = io::stdin();
         // Taking all keys in the background stops the program until the shell puts it in the foreground.
@@ -216,7 +219,7 @@ impl Terminal {
     }
 
     /// Lends the terminal to a line editor, which has it while a person writes a line. `None` if stdin is no terminal.
-    pub(super) fn lend(undo: impl Display) -> Option<Terminal> {
+    pub fn lend(undo: impl Display) -> Option<Terminal> {
         give_back_at_panic();
         let settings = tcgetattr(io::stdin()).ok()?;
         *before() = Some(Before { settings: Some(settings), undo: undo.to_string(), is_lent: true });
@@ -224,7 +227,7 @@ impl Terminal {
     }
 
     /// Writes `changes` to the terminal. `undo` undoes them.
-    pub(super) fn change(&self, changes: impl Display, undo: impl Display) -> io::Result<()> {
+    pub fn change(&self, changes: impl Display, undo: impl Display) -> io::Result<()> {
         if let Some(before) = &mut *before() {
             before.undo = undo.to_string();
         }
@@ -232,7 +235,7 @@ impl Terminal {
     }
 
     /// Whether keys are read.
-    pub(super) fn has_keys(&self) -> bool {
+    pub fn has_keys(&self) -> bool {
         self.before.is_some()
     }
 
@@ -241,7 +244,7 @@ impl Terminal {
     /// # Errors
     ///
     /// The terminal is gone.
-    pub(super) fn keys(&mut self, patience: Duration) -> io::Result<Vec<Key>> {
+    pub fn keys(&mut self, patience: Duration) -> io::Result<Vec<Key>> {
         let Some(before) = self.before.as_ref().filter(|_| is_ours()) else {
             thread::sleep(patience);
             return Ok(vec![]);

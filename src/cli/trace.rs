@@ -25,7 +25,7 @@ use pinion_trace::{perfetto, svg, timeline, vcd};
 use super::failed;
 use super::files::Output;
 use super::page::{Page, aligned, print};
-use super::status::ask::fetch;
+use super::status::fetch;
 
 /// The link of an instance, if none is named.
 const LINK: &str = "/tmp/klipper_host_mcu";

@@ -16,6 +16,7 @@ use pinion_linux::clock::Monotonic;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
+use pinion_testkit::simulator;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -55,6 +56,13 @@ pub struct Printer {
     next_id: u64,
 }
 
+/// The path of `pinion`, with `pinion-sim` beside it.
+pub fn pinion_path() -> &'static Path {
+    let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
+    simulator::build_beside(pinion);
+    pinion
+}
+
 impl Printer {
     /// A printer with a ready klippy.
     pub fn start(checkout: &Path) -> Printer {
@@ -75,7 +83,7 @@ impl Printer {
         change: impl FnOnce(String) -> String,
     ) -> Printer {
         Printer::serve(checkout, describe, change, |folder| {
-            let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            let pinion = Command::new(pinion_path())
                 .args(["run", "-r", "--board"])
                 .arg(format!("sim:{}", folder.join("board.toml").display()))
                 .arg("-I")
@@ -103,7 +111,7 @@ impl Printer {
         change: impl FnOnce(String) -> String,
     ) -> Printer {
         Printer::serve(checkout, describe, change, |folder| {
-            let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            let pinion = Command::new(pinion_path())
                 .current_dir(folder)
                 .args(["sim", "-r"])
                 .args(options)
@@ -172,7 +180,7 @@ impl Printer {
     ) -> Printer {
         // klippy recognizes a pseudo terminal by the start of its path.
         let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
-        let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["sim", "--print-board"]).output().unwrap();
+        let printed = Command::new(pinion_path()).args(["sim", "--print-board"]).output().unwrap();
         let board = describe(String::from_utf8(printed.stdout).unwrap(), &folder.path().join("trace"));
         fs::write(folder.path().join("board.toml"), board).unwrap();
         fs::write(folder.path().join("pinion.log"), "").unwrap();
@@ -205,7 +213,7 @@ impl Printer {
 
     /// Writes the changed configuration of the printer.
     pub fn configure(&mut self, change: impl FnOnce(String) -> String) {
-        let printed = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        let printed = Command::new(pinion_path())
             .arg("sim")
             .arg(self.path("board.toml"))
             .args(["--print-config", "-I"])

@@ -13,13 +13,13 @@ use nix::unistd::Pid;
 use pinion_testkit::{browser, here};
 
 use crate::checkout;
-use crate::klippy::python;
+use crate::klippy::{pinion_path, python};
 
 /// The script in a folder of its own. On ports that no other test has.
 fn script(folder: &Path) -> Command {
     let mut command = Command::new(python());
     command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/mainsail")).arg(folder);
-    command.env("PINION", env!("CARGO_BIN_EXE_pinion")).env("PORT", "18410");
+    command.env("PINION", pinion_path()).env("PORT", "18410");
     for copy in ["KLIPPER_DIR", "MOONRAKER_DIR", "MAINSAIL_DIR"] {
         command.env_remove(copy);
     }

@@ -8,7 +8,8 @@ use std::process::Command;
 
 use serde_json::{Value, json};
 
-use crate::{checkout, klippy::python};
+use crate::checkout;
+use crate::klippy::{pinion_path, python};
 use pinion_testkit::markdown::{Page, pages};
 
 /// The other sections that a printer needs.
@@ -111,7 +112,7 @@ fn klippy_takes_the_configuration_of_the_pages() {
         let found = configs.iter().any(|config| config.place.starts_with(place) && config.text.contains(part));
         assert!(found, "{place} has no such configuration any more");
     }
-    let dictionary = Command::new(env!("CARGO_BIN_EXE_pinion")).arg("dict").output().unwrap().stdout;
+    let dictionary = Command::new(pinion_path()).arg("dict").output().unwrap().stdout;
     let mut dictionary: Value = serde_json::from_slice(&dictionary).unwrap();
     let named: HashSet<&str> = configs.iter().flat_map(|config| pins(&config.text)).collect();
     for (name, number) in PINS {
@@ -127,7 +128,7 @@ fn klippy_takes_the_configuration_of_the_pages() {
 #[test]
 fn klippy_takes_what_pinion_add_writes() {
     let Some(checkout) = checkout("klippy_takes_what_pinion_add_writes") else { return };
-    let pinion = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap();
+    let pinion = |args: &[&str]| Command::new(pinion_path()).args(args).output().unwrap();
     let mut dictionary: Value = serde_json::from_slice(&pinion(&["dict"]).stdout).unwrap();
     let lines = (5..28).map(|line| (format!("GPIO{line}"), line));
     let lines = lines.chain([("spidev0.0/miso".to_owned(), (1 << 26) + (1 << 16))]);

@@ -23,7 +23,8 @@ use pinion_protocol::format;
 use pinion_protocol::vlq::Reader;
 use serde_json::{Map, Value, json};
 
-use crate::{checkout, klippy::python};
+use crate::checkout;
+use crate::klippy::{pinion_path, python};
 
 /// The dictionary of Klipper's own linux process.
 const FIRMWARE: &str = include_str!("../dictionaries/klipper-master.json");
@@ -238,7 +239,7 @@ fn klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary() {
     let Some(checkout) = checkout("klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary") else {
         return;
     };
-    let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).arg("dict").output().unwrap().stdout;
+    let printed = Command::new(pinion_path()).arg("dict").output().unwrap().stdout;
     let mut ours: Value = serde_json::from_slice(&printed).unwrap();
     let mut theirs = firmware(&ours);
     let cases = all_cases(&checkout);

@@ -11,14 +11,14 @@ use pinion_firmware::mcu::Generation;
 
 use super::checkout;
 use super::hosts;
-use super::klippy::{batch, example, without};
+use super::klippy::{batch, example, pinion_path, without};
 
 /// The sections that klippy cannot omit.
 const ALWAYS: [&str; 5] = ["mcu", "printer", "stepper_x", "stepper_y", "stepper_z"];
 const MOVES: &str = "G28\nG1 X10 Y20 Z5 F3000\nG1 X100 Y100\n";
 
 pub fn pinion(args: &[&str]) -> Vec<u8> {
-    let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap();
+    let printed = Command::new(pinion_path()).args(args).output().unwrap();
     assert!(printed.status.success(), "{printed:?}");
     printed.stdout
 }

@@ -11,7 +11,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, geteuid};
 
 use super::checkout;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, python};
+use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, pinion_path, python};
 use super::links::print_a_while;
 
 /// A child that ends with its test.
@@ -27,7 +27,7 @@ impl Drop for Running {
 
 /// `pinion link` from `near` to the Pinion of `far`.
 fn link(near: &Path, far: &Path, round_trip_ms: u32, jitter_ms: u32) -> Running {
-    let pinion = env!("CARGO_BIN_EXE_pinion");
+    let pinion = pinion_path().to_str().unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/klippy/delayed_ssh.py");
     let ssh = format!("{} {} {pinion} {round_trip_ms} {jitter_ms}", python(), script.display());
     // Only the network's delay counts, also on a busy computer. Real time is root's.
@@ -152,7 +152,7 @@ fn beside_another(checkout: &Path, delay: Option<(u32, u32)>) {
     let mut printer = Printer::start_with(checkout, |config| {
         let here = serial(&config);
         let [far, near] = ["far", "near"].map(|name| here.with_file_name(name));
-        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        let child = Command::new(pinion_path())
             .args(["run", "--board", "sim", "-r", "-I"])
             .arg(&far)
             .stderr(Stdio::null())

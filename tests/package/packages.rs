@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use pinion_testkit::process;
+use pinion_testkit::{process, simulator};
 
 /// Fills the folder that the VM sees as /share.
 pub fn share(folder: &Path) -> Result<(), String> {
@@ -16,7 +16,9 @@ pub fn share(folder: &Path) -> Result<(), String> {
         process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(folder.join(name)).arg(program))
     };
     // The program that cargo has built for all tests.
-    strip(Path::new(env!("CARGO_BIN_EXE_pinion")), "pinion")?;
+    let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
+    strip(pinion, "pinion")?;
+    strip(simulator::build_beside(pinion), "pinion-sim")?;
     strip(&host(tree)?, "host")?;
     process::run(
         Command::new(tree.join("scripts/build-deb"))
@@ -34,6 +36,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
     process::pipeline(
         r#"cd "$1"
            mv pinion-mcu_*.deb pinion-mcu.deb
+           mv pinion-sim_*.deb pinion-sim.deb
            dpkg-deb -R pinion-mcu.deb later
            sed -i 's/^Version: .*/&+later/' later/DEBIAN/control
            unit=$(find later -name pinion-mcu.service)
@@ -46,7 +49,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
     // The files for `make install`, with the program that is already built.
     process::pipeline(
         r#"cd "$1"; tar -c Makefile systemd udev man | tar -x -C "$2" --one-top-level=tree
-           install -D "$2/pinion" "$2/tree/target/release/pinion""#,
+           install -D -t "$2/tree/target/release" "$2/pinion" "$2/pinion-sim""#,
         &[&tree.display().to_string(), &folder.display().to_string()],
     )
 }

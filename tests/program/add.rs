@@ -14,7 +14,7 @@ use pinion_testkit::here;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::process::{output, program};
+use crate::process::{output, pinion_path, program};
 
 const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
 const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
@@ -373,7 +373,7 @@ fn a_full_disk_leaves_the_old_files() {
     let before = card.snapshot();
     let full = Command::new("sh")
         .args(["-c", "trap '' XFSZ; ulimit -f 0; exec \"$0\" \"$@\" 2>&1 | cat"])
-        .arg(env!("CARGO_BIN_EXE_pinion"))
+        .arg(pinion_path())
         .args(card.arguments(&["adxl345", "--yes"]))
         .output()
         .unwrap();

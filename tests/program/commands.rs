@@ -3,7 +3,6 @@
 
 use std::collections::HashMap;
 use std::fs;
-use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -12,7 +11,7 @@ use nix::sys::signal::Signal;
 use pinion_testkit::here;
 use serde_json::Value;
 
-use crate::process::{Pinion, WAIT_MAX, closed_pipe, folder_with, output};
+use crate::process::{Pinion, WAIT_MAX, closed_pipe, folder_with, output, pinion_path};
 
 /// The built-in printer with a bed that warms up within seconds.
 fn quick_printer() -> String {
@@ -357,12 +356,8 @@ fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
             &["pins"],
             &["latency", "--seconds", "2"],
         ] {
-            let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
-                .args(args)
-                .stdout(closed_pipe())
-                .stderr(Stdio::piped())
-                .spawn()
-                .unwrap();
+            let child =
+                Command::new(pinion_path()).args(args).stdout(closed_pipe()).stderr(Stdio::piped()).spawn().unwrap();
             let closed = child.wait_with_output().unwrap();
             let log = String::from_utf8(closed.stderr).unwrap();
             assert!(!log.contains("panicked"), "{args:?}: {log}");
@@ -447,7 +442,7 @@ fn the_recipe_for_ci_ends_if_the_simulated_printer_cannot_start() {
     let recipe = blocks.find(|block| block.contains("--compare part.gcode -I")).unwrap();
     let (folder, _) = folder_with("printer.toml", "no_such_key = 1\n");
     let recipe = recipe.replace("/tmp/printer", folder.path().join("tty").to_str().unwrap());
-    let program = Path::new(env!("CARGO_BIN_EXE_pinion")).parent().unwrap();
+    let program = pinion_path().parent().unwrap();
     let log = folder.path().join("log");
     let mut shell = Command::new("sh")
         .args(["-c", &recipe])

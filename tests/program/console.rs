@@ -12,11 +12,11 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 
-use crate::process::{Pinion, folder_with, program};
+use crate::process::{Pinion, folder_with, pinion_path, program};
 use crate::terminal::AtTerminal;
 
 fn console(args: &[&str], script: &str) -> Output {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let mut child = Command::new(pinion_path())
         .arg("console")
         .args(args)
         .env_remove("JOURNAL_STREAM")
@@ -221,7 +221,8 @@ fn console_ended_by(signal: Signal) -> ExitStatus {
 #[test]
 fn started_by_nohup_it_outlives_its_terminal() {
     let mut child = Command::new("nohup")
-        .args([env!("CARGO_BIN_EXE_pinion"), "console", "--board", "sim"])
+        .arg(pinion_path())
+        .args(["console", "--board", "sim"])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
@@ -241,7 +242,7 @@ fn started_by_nohup_it_outlives_its_terminal() {
 #[test]
 fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
     let terminal = openpty(None, None).unwrap();
-    let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let child = Command::new(pinion_path())
         .args(["console", "--board", "sim"])
         .stdin(Stdio::from(terminal.slave))
         .stdout(Stdio::piped())

@@ -17,7 +17,7 @@ use pinion_protocol::block::{Sequence, frame};
 use pinion_protocol::vlq::Writer;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX, as_nobody};
+use crate::process::{Pinion, WAIT_MAX, as_nobody, pinion_path};
 use crate::terminal::AtTerminal;
 
 /// A member of the terminal's group that has it open.
@@ -57,8 +57,7 @@ fn a_terminal_that_a_client_closed_to_others_is_replaced_when_the_client_leaves(
     // All parts of the program know the new terminal.
     let now = fs::read_link(pinion.link()).unwrap();
     assert_ne!(now, before);
-    let status =
-        Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status", "--json", "-I"]).arg(pinion.link()).output();
+    let status = Command::new(pinion_path()).args(["status", "--json", "-I"]).arg(pinion.link()).output();
     let status = String::from_utf8(status.unwrap().stdout).unwrap();
     assert!(status.contains(&format!("\"{}\"", now.display())), "{status}");
     assert!(status.contains("\"attached\":true") || status.contains("\"attached\": true"), "{status}");
@@ -187,7 +186,7 @@ fn a_client_that_comes_and_goes_at_will_does_not_fill_the_log() {
 fn three_at_once(folder: &TempDir) -> Vec<(Child, PathBuf)> {
     let start = |number: usize| {
         let log = folder.path().join(format!("log{number}"));
-        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        let child = Command::new(pinion_path())
             .args(["run", "--board", "sim", "-I"])
             .arg(folder.path().join("tty"))
             .args(["--socket".as_ref(), folder.path().join(format!("sock{number}")).as_os_str()])
@@ -245,7 +244,7 @@ fn standard_input_and_output_are_given_back_as_they_were() {
     let folder = tempfile::tempdir().unwrap();
     for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT, Signal::SIGALRM, Signal::SIGXCPU] {
         let log = folder.path().join(signal.as_str());
-        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        let mut command = Command::new(pinion_path());
         command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
         let mut program = AtTerminal::start(&mut command, 24, Some(File::create(&log).unwrap().into()));
         program.wait_for("the program", |_| fs::read_to_string(&log).unwrap().contains("serving on").then_some(()));

@@ -19,7 +19,7 @@ use pinion_client::serial::{BlockLink, Port};
 use tempfile::TempDir;
 
 use crate::cut::begin;
-use crate::process::{Pinion, WAIT_MAX};
+use crate::process::{Pinion, WAIT_MAX, pinion_path};
 use crate::terminal::AtTerminal;
 
 /// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
@@ -127,7 +127,7 @@ fn a_link_that_run_refuses_is_an_error_of_the_check() {
     for link in [&*format!("serial:{}", file.display()), &folder_itself, "can:lo,0123456789ab"] {
         let run = |more: &[&str]| {
             let args = [&["run", "--board", "sim", "--link", link, "-I", "/tmp/klipper_host_refused"], more].concat();
-            Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).stdin(Stdio::null()).output().unwrap()
+            Command::new(pinion_path()).args(args).stdin(Stdio::null()).output().unwrap()
         };
         let (refused, checked) = (run(&[]), run(&["--check"]));
         let log = String::from_utf8(refused.stderr).unwrap();
@@ -176,7 +176,7 @@ fn a_serial_port_that_another_program_uses_is_an_error_of_one_line() {
 fn log_of_stdio(is_in_use: bool) -> String {
     let folder = tempfile::tempdir().unwrap();
     let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let mut child = Command::new(pinion_path())
         .args(["run", "--board", "sim", "--link", "stdio", "-I"])
         .arg(folder.path().join("tty"))
         .env("STATE_DIRECTORY", folder.path())
@@ -219,7 +219,7 @@ fn the_end_of_standard_input_stops_an_mcu_that_is_in_use_with_a_verdict() {
 fn a_person_s_terminal_is_no_wire_and_a_program_s_may_be() {
     let folder = tempfile::tempdir().unwrap();
     let run = || {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        let mut command = Command::new(pinion_path());
         command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
         command
     };

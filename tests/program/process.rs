@@ -13,6 +13,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
 use pinion_client::serial::Port;
+use pinion_testkit::simulator;
 use tempfile::TempDir;
 
 /// Timeout of a test: long enough for any busy computer, because no test here measures speed.
@@ -80,7 +81,7 @@ impl Pinion {
         let child = Command::new("unshare")
             .args(["--mount", "sh", "-ec", &script, "sh"])
             .arg(folder.path())
-            .arg(env!("CARGO_BIN_EXE_pinion"))
+            .arg(pinion_path())
             .args(args)
             .env_remove("JOURNAL_STREAM")
             .stdout(Stdio::null())
@@ -220,8 +221,15 @@ impl Drop for Pinion {
 /// The program, with each signal at its default: `nohup make test &` would have it ignore some.
 pub fn program() -> Command {
     let mut program = Command::new("env");
-    program.args(["--default-signal", env!("CARGO_BIN_EXE_pinion")]);
+    program.arg("--default-signal").arg(pinion_path());
     program
+}
+
+/// The path of `pinion`, with `pinion-sim` beside it.
+pub fn pinion_path() -> &'static Path {
+    let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
+    simulator::build_beside(pinion);
+    pinion
 }
 
 /// The same command as an ordinary user.
@@ -236,7 +244,8 @@ pub fn as_nobody(command: &mut Command) -> &mut Command {
 /// starts a program meanwhile would inherit our file, and a file that is open for writing cannot be run.
 pub fn program_in(folder: &Path) -> PathBuf {
     let program = folder.join("pinion");
-    assert!(Command::new("cp").arg(env!("CARGO_BIN_EXE_pinion")).arg(&program).status().unwrap().success());
+    let simulator = simulator::build_beside(pinion_path());
+    assert!(Command::new("cp").args([pinion_path(), simulator, folder]).status().unwrap().success());
     program
 }
 
@@ -257,13 +266,13 @@ pub fn closed_pipe() -> std::io::PipeWriter {
 
 /// Runs `pinion` to its end.
 pub fn output(args: &[&str]) -> std::process::Output {
-    Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap()
+    Command::new(pinion_path()).args(args).output().unwrap()
 }
 
 /// The same with at most 3 GB of memory, and not forever. Returns its status and all that it printed.
 pub fn limited(args: &[&str]) -> (Option<i32>, String) {
     let mut limited = Command::new("sh");
-    limited.args(["-c", "ulimit -v 3000000; exec timeout 100 \"$0\" \"$@\"", env!("CARGO_BIN_EXE_pinion")]);
+    limited.args(["-c", "ulimit -v 3000000; exec timeout 100 \"$0\" \"$@\""]).arg(pinion_path());
     let output = limited.args(args).output().unwrap();
     (output.status.code(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
 }

@@ -19,7 +19,7 @@ use pinion_testkit::here;
 use pinion_trace::event::Event;
 use pinion_trace::file::{End, Trace};
 
-use crate::process::{Pinion, WAIT_MAX};
+use crate::process::{Pinion, WAIT_MAX, pinion_path};
 
 /// The user `nobody`.
 const NOBODY: u32 = 65534;
@@ -151,7 +151,7 @@ fn a_running_program_gives_its_recording() {
         assert_eq!(trace.head.end, End::Asked);
         trace.head.names.objects.contains_key(&0)
     });
-    let status = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status", "-I"]).arg(pinion.link()).output().unwrap();
+    let status = Command::new(pinion_path()).args(["status", "-I"]).arg(pinion.link()).output().unwrap();
     let page = String::from_utf8(status.stdout).unwrap();
     assert!(page.contains("\nrecorder  up to "), "{page}");
 }
@@ -291,7 +291,7 @@ fn a_recording_with_a_time_in_the_future_is_not_the_newest_for_ever() {
     configure(&mut client, &[OUTPUT]);
     client.send_line("emergency_stop").unwrap();
     pinion.logged("(pinion trace ");
-    let mut newest = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let mut newest = Command::new(pinion_path());
     let newest = newest.arg("trace").env("STATE_DIRECTORY", pinion.state()).output().unwrap();
     let page = String::from_utf8_lossy(&newest.stdout);
     assert!(page.starts_with("verdict: nobody was late"), "{page}{}", String::from_utf8_lossy(&newest.stderr));

@@ -11,7 +11,7 @@ use nix::sys::signal::Signal;
 use pinion_client::Client;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output};
+use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output, pinion_path};
 use crate::terminal::AtTerminal;
 
 const STRIP: &[&str] = &[
@@ -66,7 +66,7 @@ fn each_change_is_a_line() {
 /// `pinion sim --show` at a terminal, with its link in this folder.
 fn show(folder: &TempDir) -> (AtTerminal, PathBuf) {
     let link = folder.path().join("tty");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let mut command = Command::new(pinion_path());
     (AtTerminal::start(command.args(["sim", "--show", "-I"]).arg(&link), 40, Some(Stdio::null())), link)
 }
 

@@ -15,11 +15,11 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
 
-use crate::process::{Pinion, WAIT_MAX, exists};
+use crate::process::{Pinion, WAIT_MAX, exists, pinion_path};
 
 /// A script in the place of ssh. `before` runs first, for example `exit 255`.
 fn fake_ssh(folder: &Path, before: &str) -> PathBuf {
-    let program = Path::new(env!("CARGO_BIN_EXE_pinion")).parent().unwrap();
+    let program = pinion_path().parent().unwrap();
     let script = format!(
         "#!/bin/sh\n{before}\nwhile [ \"$1\" != -- ]; do shift; done\nshift 2\nPATH='{}':$PATH exec sh -c \"$*\"\n",
         program.display()
@@ -153,7 +153,7 @@ fn a_terminal_is_for_one_host_only() {
 #[test]
 fn an_attach_that_hears_nothing_gives_the_terminal_back() {
     let far = Pinion::simulated(&[]);
-    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let mut child = Command::new(pinion_path())
         .args(["attach", "-I"])
         .arg(far.link())
         .stdin(Stdio::piped())
@@ -180,7 +180,7 @@ fn an_attach_gives_its_pipes_back_as_they_were() {
     for is_killed in [false, true] {
         let (input, writer) = io::pipe().unwrap();
         let (mut reader, output) = io::pipe().unwrap();
-        let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        let mut child = Command::new(pinion_path())
             .args(["attach", "-I"])
             .arg(far.link())
             .stdin(input.try_clone().unwrap())

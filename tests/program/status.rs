@@ -17,7 +17,7 @@ use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{FlowArg, tcflow};
 use serde_json::{Value, json};
 
-use crate::process::{Pinion, WAIT_MAX, exists, output};
+use crate::process::{Pinion, WAIT_MAX, exists, output, pinion_path};
 use crate::terminal::AtTerminal;
 
 fn socket(pinion: &Pinion) -> PathBuf {
@@ -26,7 +26,7 @@ fn socket(pinion: &Pinion) -> PathBuf {
 
 fn ask(pinion: &Pinion, args: &[&str]) -> std::process::Output {
     let link = pinion.link();
-    Command::new(env!("CARGO_BIN_EXE_pinion")).arg("status").args(args).arg("-I").arg(link).output().unwrap()
+    Command::new(pinion_path()).arg("status").args(args).arg("-I").arg(link).output().unwrap()
 }
 
 pub fn status(pinion: &Pinion) -> Value {
@@ -185,7 +185,7 @@ fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
 
 fn watch(pinion: &Pinion) -> Command {
     pinion.until("the socket", || exists(&socket(pinion)));
-    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let mut command = Command::new(pinion_path());
     command.args(["status", "--watch", "-I"]).arg(pinion.link());
     command
 }
@@ -287,7 +287,7 @@ fn the_folder_is_the_one_that_takes_recordings() {
     fs::write(&none, "").unwrap();
     fs::create_dir(&state).unwrap();
     let link = folder.path().join("tty");
-    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let mut child = Command::new(pinion_path())
         .args(["run", "--board", "sim", "-I"])
         .arg(&link)
         .env("STATE_DIRECTORY", format!("{}:{}", none.display(), state.display()))
@@ -299,8 +299,7 @@ fn the_folder_is_the_one_that_takes_recordings() {
     while !exists(&socket) && Instant::now() < end {
         thread::sleep(std::time::Duration::from_millis(10));
     }
-    let asked =
-        Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status", "--json", "-I"]).arg(&link).output().unwrap();
+    let asked = Command::new(pinion_path()).args(["status", "--json", "-I"]).arg(&link).output().unwrap();
     let _ = child.kill();
     let _ = child.wait();
     let status: Value = serde_json::from_slice(&asked.stdout).unwrap();
@@ -324,7 +323,7 @@ fn a_crowd_is_waited_for_and_then_named() {
     })
     .collect();
     let ask = || {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        let mut command = Command::new(pinion_path());
         command.args(["status", "--socket"]).arg(&path).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     };
     let refused = ask().wait_with_output().unwrap();

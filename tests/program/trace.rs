@@ -15,7 +15,7 @@ use pinion_trace::file::{End, Head, Names, Thread, Trace};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX};
+use crate::process::{Pinion, WAIT_MAX, pinion_path};
 
 /// When the recording ended, in ticks.
 const END: u64 = 10 * SECOND;
@@ -70,7 +70,7 @@ fn bytes(trace: &Trace) -> Vec<u8> {
 
 /// Runs `pinion trace` where its recordings are in this folder.
 fn trace(folder: &Path, args: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let mut command = Command::new(pinion_path());
     command.arg("trace").args(args).env("STATE_DIRECTORY", folder).env("HOME", folder).env_remove("XDG_STATE_HOME");
     command.output().unwrap()
 }

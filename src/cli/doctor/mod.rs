@@ -234,7 +234,7 @@ mod tests {
         tree.link("tmp/klipper_host_mcu", &format!("/dev/{name}"));
         let groups = examine(&tree.computer());
         let page = finding::text(&groups);
-        super::super::page::tests::assert_plain(&page.to_string(), page.lines().count());
+        pinion_testkit::names::assert_plain(&page.to_string(), page.lines().count());
         let is_ours = |line: &str| {
             ["  ok       ", "  warning  ", "  error    ", "           -> "].iter().any(|head| line.starts_with(head))
                 || groups.iter().any(|group| group.name == line)

@@ -25,8 +25,9 @@ const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 const ANSWER_MAX: usize = 4 << 20;
 
 /// A Pinion's answer.
-pub(in crate::cli) struct Answer {
-    pub(in crate::cli) status: Status,
+pub struct Answer {
+    /// What it says.
+    pub status: Status,
     /// One line about the fields that this version does not know.
     pub(super) notice: Option<String>,
 }
@@ -38,7 +39,7 @@ pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
 }
 
 /// Asks the first of these sockets that answers. They are of the instance with this link.
-pub(in crate::cli) fn ask_at(paths: &[PathBuf], link: &Path) -> Result<Answer, String> {
+pub fn ask_at(paths: &[PathBuf], link: &Path) -> Result<Answer, String> {
     let (path, document) = fetch(paths, link, ANSWER_MAX)?;
     answer(&path, &document)
 }

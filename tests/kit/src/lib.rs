@@ -7,6 +7,7 @@
 //! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
 //! - [`browser`]: a page as a person sees it
 //! - [`names`]: names that others chose, for property tests
+//! - [`simulator`]: the program `pinion-sim`
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
@@ -24,6 +25,7 @@ pub mod kernel;
 pub mod markdown;
 pub mod names;
 pub mod process;
+pub mod simulator;
 pub mod tools;
 
 /// A file's error, with what failed on which path.

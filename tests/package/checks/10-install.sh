@@ -5,7 +5,14 @@ until_true 30 is_active test-chips
 not id pinion 2>/dev/null
 stat -c '%U:%G %n' /dev/gpiochip0 /dev/watchdog
 apt-get -qq update
-apt-get install -y /share/pinion-mcu.deb
+apt-get install -y --no-install-recommends /share/pinion-mcu.deb
+# The simulated printer is another package.
+status=0
+said=$(pinion run --board sim 2>&1) || status=$?
+is $status 1 "the exit status without a simulator"
+case $said in *'sudo apt install pinion-sim'*) ;; *) fail "without a simulator it says: $said" ;; esac
+apt-get install -y /share/pinion-sim.deb
+pinion dict --board sim >/dev/null
 is "$(systemctl is-enabled pinion-mcu || true)" disabled
 is "$(systemctl is-active pinion-mcu || true)" inactive
 is "$(id -nG pinion | tr ' ' '\n' | sort | xargs)" "dialout gpio i2c pinion spi tty"

@@ -11,7 +11,7 @@ is "$(systemctl list-units --all --plain --no-legend 'pinion-mcu*')" "" "the uni
 [ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
 # The user must remove the configuration of an instance.
 rm -f /etc/pinion/second.toml
-apt-get purge -y pinion-mcu
+apt-get purge -y pinion-mcu pinion-sim
 [ ! -e /etc/pinion ]
 id pinion
 left=$(find / -xdev \( -path /proc -o -path /sys -o -path /share -o -path /var/log -o -path /run \) -prune -o \

@@ -63,7 +63,9 @@ bare() {
     until_true 60 is_active test-chips
     apt-get -qq update
     fresh
-    if dpkg -s pinion-mcu >/dev/null 2>&1; then apt-get -qq purge -y pinion-mcu; fi
+    for package in pinion-mcu pinion-sim; do
+        if dpkg -s $package >/dev/null 2>&1; then apt-get -qq purge -y $package; fi
+    done
     apt-get -qq autoremove -y --purge libiio0
     new_user
 }
@@ -76,6 +78,7 @@ installed() {
         bare
         apt-get -qq install -y /share/pinion-mcu.deb
     fi
+    if ! dpkg -s pinion-sim >/dev/null 2>&1; then apt-get -qq install -y /share/pinion-sim.deb; fi
     usermod -aG tty pi
     systemctl enable pinion-mcu
     systemctl restart pinion-mcu
@@ -109,7 +112,11 @@ instead() {
         rm -rf "$deb"
         install -D -m 644 /share/later.deb "$deb/$(deb_name /share/later.deb)"
         ;;
-    *'make deb'*) install -D -m 644 /share/pinion-mcu.deb "$deb/$(deb_name /share/pinion-mcu.deb)" ;;
+    *'make deb'*)
+        for package in /share/pinion-mcu.deb /share/pinion-sim.deb; do
+            install -D -m 644 $package "$deb/$(deb_name $package)"
+        done
+        ;;
     esac
 }
-deb_name() { dpkg-deb -f "$1" Version | sed "s/.*/pinion-mcu_&_$(dpkg --print-architecture).deb/"; }
+deb_name() { dpkg-deb --show --showformat='${Package}_${Version}_${Architecture}.deb' "$1"; }

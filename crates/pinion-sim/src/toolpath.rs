@@ -12,9 +12,9 @@ use std::time::Duration;
 
 use clap::Args;
 
-use crate::cli::failed;
-use crate::cli::files::{self, Output};
-use crate::cli::page::{Page, aligned, print};
+use pinion::cli::failed;
+use pinion::cli::files::{self, Output};
+use pinion::cli::page::{Page, aligned, print};
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_firmware::trouble::Trouble;
 use pinion_sim::{
@@ -30,7 +30,7 @@ const LATE: Ticks = Ticks::from_ms(450);
 
 /// Options about the path of the motors.
 #[derive(Args, Clone, Debug)]
-pub(in crate::cli) struct PathArgs {
+pub(crate) struct PathArgs {
     /// At the end, write the path that the motors went: layers seen from above (.svg), the filament as a body (.stl),
     /// or moves (.gcode). It serves a host, without the demonstration
     #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "print_config", "print_board"])]
@@ -38,7 +38,7 @@ pub(in crate::cli) struct PathArgs {
     /// At the end, print how far the motors' path was from the one that this file asks for. It serves a host,
     /// without the demonstration
     #[arg(long, value_name = "FILE.gcode", conflicts_with_all = ["demo", "print_config", "print_board"])]
-    pub(super) compare: Option<PathBuf>,
+    pub(crate) compare: Option<PathBuf>,
     /// The distance along x and y above which `--compare` ends with exit status 1
     #[arg(long, value_name = "MM", requires = "compare", default_value_t = 0.1)]
     within: f64,
@@ -53,7 +53,7 @@ enum Form {
 }
 
 /// The files of the options, checked before the printer starts.
-pub(in crate::cli) struct Files {
+pub(crate) struct Files {
     toolpath: Option<(Output, Form)>,
     compare: Option<(PathBuf, AskedPath)>,
     within_mm: f64,
@@ -61,7 +61,7 @@ pub(in crate::cli) struct Files {
 
 impl Files {
     /// Checks the files; `None` without the options. The command reads `inputs`.
-    pub(in crate::cli) fn check(args: &PathArgs, inputs: &[&Path]) -> Result<Option<Files>, String> {
+    pub(crate) fn check(args: &PathArgs, inputs: &[&Path]) -> Result<Option<Files>, String> {
         if args.toolpath.is_none() && args.compare.is_none() {
             return Ok(None);
         }
@@ -100,7 +100,7 @@ fn form(path: &Path) -> Result<Form, String> {
 }
 
 /// The thread that records the path.
-pub(in crate::cli) struct PathRecord {
+pub(crate) struct PathRecord {
     files: Files,
     probe: SimProbe,
     stop: Sender<()>,
@@ -114,7 +114,7 @@ struct Recorded {
 
 impl PathRecord {
     /// Records from now on. Start it before the MCU runs: a real-time thread passes its scheduling on.
-    pub(in crate::cli) fn record(files: Files, probe: SimProbe) -> io::Result<PathRecord> {
+    pub(crate) fn record(files: Files, probe: SimProbe) -> io::Result<PathRecord> {
         let (stop, stopped) = mpsc::channel::<()>();
         let watched = probe.clone();
         let mut recorded = Recorded { recorder: probe.recorder(), rings: probe.rings() };
@@ -141,7 +141,7 @@ impl PathRecord {
     }
 
     /// Writes and compares the path after the MCU has ended. The exit status is 1 if something is wrong with it.
-    pub(in crate::cli) fn end(self) -> ExitCode {
+    pub(crate) fn end(self) -> ExitCode {
         let PathRecord { files, probe, stop, recorded } = self;
         drop(stop);
         let Ok(recorded) = recorded.join() else {

@@ -18,13 +18,13 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 use pinion_sim::{BedShape, Colour, Look, PartConfig, PathPoint, Recorder, SimConfig, SimProbe, Space};
 
-use super::own_status::OwnStatus;
+use crate::own_status::OwnStatus;
 use targets::Targets;
 
 mod targets;
 
 /// Where the camera is served unless told otherwise.
-pub(super) const ADDRESS: &str = "127.0.0.1:8410";
+pub(crate) const ADDRESS: &str = "127.0.0.1:8410";
 /// The camera waits for everything else on this computer.
 const NICE: i32 = 10;
 /// Time between two looks at the steps: the printer keeps half a second of them.
@@ -42,7 +42,7 @@ const WARM_WHITE: Rgb = [255, 240, 205];
 const NO_BED: Space = Space { bed: BedShape::Rectangle { min_mm: [0.0; 2], max_mm: [200.0; 2] }, height_mm: 200.0 };
 
 /// An address as `--camera` takes it.
-pub(super) fn parse(text: &str) -> Result<String, String> {
+pub(crate) fn parse(text: &str) -> Result<String, String> {
     match text.rsplit_once(':') {
         Some((host, port)) if !host.is_empty() && port.parse::<u16>().is_ok() => Ok(text.to_owned()),
         _ => Err(format!("give ADDR:PORT, such as {ADDRESS}; a FILE.toml comes before --camera")),
@@ -50,7 +50,7 @@ pub(super) fn parse(text: &str) -> Result<String, String> {
 }
 
 /// A camera that nobody can look through yet.
-pub(super) struct Camera {
+pub(crate) struct Camera {
     listener: TcpListener,
     gantry: Gantry,
     probes: Vec<Probe>,
@@ -58,7 +58,7 @@ pub(super) struct Camera {
 
 impl Camera {
     /// Takes the address, and what never changes about the printer.
-    pub(super) fn open(address: &str, config: &SimConfig) -> Result<Camera, Trouble> {
+    pub(crate) fn open(address: &str, config: &SimConfig) -> Result<Camera, Trouble> {
         let listener = bind(address).map_err(|trouble| trouble.of(format_args!("--camera {address}")))?;
         let gantry = match &config.delta {
             Some(delta) => Gantry::Delta { towers_mm: delta.towers_mm(), arm_mm: delta.arm_mm },
@@ -70,7 +70,7 @@ impl Camera {
 
     /// Serves the picture from now on, and says where. Call it before this thread runs in real time: the camera's
     /// threads get its scheduling.
-    pub(super) fn start(self, sim: SimProbe, own: OwnStatus) -> Result<(), Trouble> {
+    pub(crate) fn start(self, sim: SimProbe, own: OwnStatus) -> Result<(), Trouble> {
         let Camera { listener, gantry, probes } = self;
         let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
         let printer = Printer { bed: shape(bed), height_mm, gantry };

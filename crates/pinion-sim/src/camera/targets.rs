@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use crate::cli::own_status::OwnStatus;
+use crate::own_status::OwnStatus;
 use pinion_runtime::klippy::process;
 
 /// Time between two questions.

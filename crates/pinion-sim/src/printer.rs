@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion sim`: the simulated printer, shown at work by our own client.
+//! The simulated printer, shown at work by our own client.
 
 #![forbid(unsafe_code)]
 
@@ -17,8 +17,8 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use super::demo::heater::Goal;
-use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
+use crate::demo::heater::Goal;
+use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
@@ -27,20 +27,18 @@ use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 use pinion_trace::folder::folders;
 
-use super::camera::{self, Camera};
-use super::files::Output;
-use super::own_status::OwnStatus;
-use super::page::{Page, print};
-use super::settings::sim_config;
-use super::show::Show;
-use super::{failed, logging};
-use toolpath::{Files, PathArgs, PathRecord};
+use crate::camera::{self, Camera};
+use crate::description::read;
+use crate::own_status::OwnStatus;
+use crate::show::Show;
+use crate::toolpath::{Files, PathArgs, PathRecord};
+use pinion::cli::files::Output;
+use pinion::cli::page::{Page, print};
+use pinion::cli::{failed, logging};
 
-mod toolpath;
-
-/// Options of `pinion sim`.
+/// Options of `pinion-sim`.
 #[derive(Args, Clone, Debug)]
-pub(super) struct SimArgs {
+pub(crate) struct SimArgs {
     /// The printer's description; the built-in printer if left out
     #[arg(value_name = "FILE.toml")]
     file: Option<PathBuf>,
@@ -79,8 +77,8 @@ pub(super) struct SimArgs {
 }
 
 /// Shows the printer at work and continues to serve it, or prints its configuration.
-pub(super) fn run(args: &SimArgs) -> ExitCode {
-    let config = match sim_config(args.file.as_deref()) {
+pub(crate) fn run(args: &SimArgs) -> ExitCode {
+    let config = match read(args.file.as_deref()) {
         Ok(config) => config,
         Err(error) => return failed(error),
     };

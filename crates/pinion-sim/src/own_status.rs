@@ -13,7 +13,7 @@ use std::time::Duration;
 use pinion_linux::foreign::plain;
 use pinion_runtime::status::form::{State, Status};
 
-use super::status::ask::ask_at;
+use pinion::cli::status::ask_at;
 
 /// Time between two questions.
 const PERIOD: Duration = Duration::from_millis(300);
@@ -27,11 +27,11 @@ struct Facts {
 
 /// The status of this program's MCU, a moment ago.
 #[derive(Clone, Default)]
-pub(super) struct OwnStatus(Arc<Mutex<Facts>>);
+pub(crate) struct OwnStatus(Arc<Mutex<Facts>>);
 
 impl OwnStatus {
     /// Asks from now on at these paths. Call it before this thread runs in real time: a thread passes that on.
-    pub(super) fn start(paths: Vec<PathBuf>, link: &Path) -> io::Result<OwnStatus> {
+    pub(crate) fn start(paths: Vec<PathBuf>, link: &Path) -> io::Result<OwnStatus> {
         let own = OwnStatus::default();
         let (asker, link) = (own.clone(), link.to_owned());
         thread::Builder::new().name("own status".into()).spawn(move || {
@@ -59,12 +59,12 @@ impl OwnStatus {
     }
 
     /// The host's text for why the MCU is shut down. `None` while it is not.
-    pub(super) fn stop(&self) -> Option<String> {
+    pub(crate) fn stop(&self) -> Option<String> {
         self.facts().stop
     }
 
     /// The host's process, if it is known.
-    pub(super) fn host(&self) -> Option<u32> {
+    pub(crate) fn host(&self) -> Option<u32> {
         self.facts().host
     }
 }

@@ -6,10 +6,10 @@
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-pub(super) mod heater;
+pub(crate) mod heater;
 
-use crate::cli::terminal::ERASE_LINE;
 use heater::{Goal, Heater, Wiring};
+use pinion::cli::terminal::ERASE_LINE;
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use pinion_client::{Client, Error};
@@ -466,9 +466,9 @@ fn heat(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::assert_plain;
     use pinion_protocol::clock::Clock;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
 
     fn shown(live: bool) -> String {

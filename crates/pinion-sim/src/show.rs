@@ -22,13 +22,13 @@ use pinion_linux::clock::monotonic;
 use pinion_linux::foreign::plain;
 use pinion_sim::SimProbe;
 
-use super::own_status::OwnStatus;
-use super::page::draw;
-use super::terminal::{
+use crate::own_status::OwnStatus;
+use changes::Changes;
+use pinion::cli::page::draw;
+use pinion::cli::terminal::{
     DELETE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Size, Terminal, all_scrolls, give_back_at, off,
     on, scrolling, size, to_row, up,
 };
-use changes::Changes;
 
 mod changes;
 
@@ -276,7 +276,7 @@ impl Screen {
 }
 
 /// The thread that shows the printer.
-pub(super) struct Show {
+pub(crate) struct Show {
     /// Starts it. When this is dropped, the thread ends.
     go: Sender<()>,
     done: Receiver<()>,
@@ -285,7 +285,7 @@ pub(super) struct Show {
 impl Show {
     /// Makes a thread that will show the printer on stdout. Make it before the MCU runs. A real-time thread passes its
     /// scheduling on to the threads that it starts. Such a thread would keep a host from the processor.
-    pub(super) fn prepare(probe: SimProbe, own: OwnStatus) -> io::Result<Show> {
+    pub(crate) fn prepare(probe: SimProbe, own: OwnStatus) -> io::Result<Show> {
         let (go, went) = mpsc::channel();
         let (finished, done) = mpsc::channel();
         thread::Builder::new().name("show".into()).spawn(move || {
@@ -302,13 +302,13 @@ impl Show {
     }
 
     /// Shows the printer from now on.
-    pub(super) fn begin(&self) {
+    pub(crate) fn begin(&self) {
         // It fails only if the thread is gone. Then nothing can be shown.
         let _ = self.go.send(());
     }
 
     /// Shows the final state and gives the terminal back, unless nobody reads there.
-    pub(super) fn end(self) {
+    pub(crate) fn end(self) {
         drop(self.go);
         let _ = self.done.recv_timeout(FAREWELL);
     }
@@ -360,11 +360,11 @@ fn show(look: impl Fn() -> Vec<Item>, stopped: &Receiver<()>) -> io::Result<()> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::assert_plain;
     use pinion_testkit::names::any_name;
+    use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;
 
-    pub(super) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {
+    pub(crate) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {
         let number = value.map(|value| Number { value, step: 1.0, ripple: 0.0 });
         Item { kind, name: name.into(), number, text: text.into() }
     }
