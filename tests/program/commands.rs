@@ -409,8 +409,14 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         let script = output(&["completions", shell]);
         assert!(script.status.success());
         let script = String::from_utf8(script.stdout).unwrap();
-        for word in ["doctor", "latency", "print-config", "dialect"] {
+        for word in ["doctor", "latency", "sim", "dialect"] {
             assert!(script.contains(word), "{shell} knows no {word}");
+        }
+        let of_the_simulator = output(&["sim", "completions", shell]);
+        assert!(of_the_simulator.status.success());
+        let of_the_simulator = String::from_utf8(of_the_simulator.stdout).unwrap();
+        for word in ["pinion-sim", "print-config", "toolpath"] {
+            assert!(of_the_simulator.contains(word), "{shell} knows no {word}");
         }
         // Values of the options that have fixed values instead of files.
         for word in ["linux", "auto", "kalico", "trace"] {

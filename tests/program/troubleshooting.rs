@@ -54,7 +54,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 /// The program's sources without their tests, with each literal in its printed form, and the service's script.
 fn sources() -> Vec<(String, String)> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let crates = ["camera", "client", "firmware", "linux", "protocol", "runtime", "sim", "trace"];
+    let crates = ["camera", "client", "firmware", "linux", "pinion-sim", "protocol", "runtime", "sim", "trace"];
     let crates = crates.map(|name| format!("crates/{name}/src"));
     let mut all: Vec<PathBuf> = crates.iter().flat_map(|folder| files(&root.join(folder))).collect();
     all.extend(files(&root.join("src")));

@@ -20,7 +20,8 @@ const GROUPS_BYTES_MAX: u64 = 4096;
 /// link.
 const YOUNGER_MAX_S: i64 = 1;
 /// The programs that serve hosts, each with its name for people.
-const PROGRAMS: [(&str, &str); 2] = [("pinion", "Pinion"), ("klipper_mcu", "Klipper's own klipper_mcu")];
+const PROGRAMS: [(&str, &str); 3] =
+    [("pinion", "Pinion"), ("pinion-sim", "Pinion"), ("klipper_mcu", "Klipper's own klipper_mcu")];
 
 /// A terminal that a running program serves.
 #[derive(Debug)]

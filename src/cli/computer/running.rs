@@ -95,7 +95,7 @@ impl Computer {
     /// Whether a process is called like a Pinion that serves hosts, and is none of its helpers.
     fn is_pinion(&self, process: &Process) -> bool {
         let is_helper = |name: String| helpers::NAMES.iter().any(|helper| name.as_bytes() == helper.to_bytes());
-        process.program().is_some_and(|program| program == "pinion")
+        process.is_pinion()
             && !self.text(format!("/proc/{}/comm", process.pid)).is_some_and(is_helper)
             // Another version's command line is not understood.
             && run_args(words(process)).map_or(true, |args| args.is_some())

@@ -217,10 +217,19 @@ impl Process {
         fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")).is_err()
     }
 
+    /// Whether it was started as `pinion`, or as `pinion run` with a simulated board, which is another program.
+    pub fn is_pinion(&self) -> bool {
+        let runs = || self.has_command("run");
+        self.program().is_some_and(|program| program == "pinion" || program == "pinion-sim" && runs())
+    }
+
     /// Whether it carries a host of another computer: `pinion attach`.
     pub fn is_attach(&self) -> bool {
-        self.program().is_some_and(|program| program == "pinion")
-            && self.arguments.get(1).is_some_and(|command| command == Path::new("attach"))
+        self.is_pinion() && self.has_command("attach")
+    }
+
+    fn has_command(&self, name: &str) -> bool {
+        self.arguments.get(1).is_some_and(|command| command == Path::new(name))
     }
 
     /// Whether it was started like klippy.
