@@ -14,8 +14,8 @@ use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_linux::clock::Monotonic;
 
-use super::realtime::{self, Processors, Role, Scheduling};
-use super::wakeup::{MarginLimits, Waiter};
+use crate::core::wakeup::{MarginLimits, Waiter};
+use crate::process::realtime::{self, Processors, Role, Scheduling};
 
 /// The time between two events: 1,000 a second, so that the program really sleeps in between.
 const PERIOD: Ticks = Ticks::from_us(1000);

@@ -12,12 +12,9 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 #![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
-use std::fmt;
-use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::Duration;
 
 use log::{error, info, warn};
 
@@ -30,78 +27,62 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 
 mod bridge;
-mod budget;
 mod core;
-mod core_end;
-mod core_thread;
-mod forked;
 pub mod guardian;
-pub mod helpers;
 mod host;
-mod host_end;
-mod introduction;
-pub mod klippy;
 pub mod latency;
-mod ledger;
 mod link;
-mod link_thread;
-mod lookout;
-mod notify;
-mod outlet;
-mod oversight;
-mod place;
-mod pulse;
-pub mod realtime;
+mod process;
 mod recorder;
-mod served;
-mod signals;
 pub mod status;
-mod survey;
-mod terminal_group;
-pub mod wakeup;
-mod watchdog;
-mod workers;
+mod transport;
+mod trouble;
 
 /// What the targets in `fuzz/` call.
 #[cfg(fuzzing)]
 pub mod fuzz {
     pub use super::guardian::fuzz::guardian;
-    pub use super::host::search;
-    pub use super::link_thread::fuzz::link;
+    pub use super::host::search::search;
+    pub use super::link::thread::fuzz::link;
 }
 
 pub use bridge::attach::attach;
 pub use bridge::near::link as link_over_ssh;
 pub use bridge::ssh::Target;
+pub use core::wakeup;
 pub use guardian::Guardian;
-pub use helpers::Helpers;
-pub use host::HostSearch;
-pub use link::LinkName;
-pub use link::can::{CanbusUuid, can_open, uuid as can_uuid};
-pub use link::pty::Access;
-pub use link::stdio::give_back;
-pub use place::Place;
+pub use host::klippy;
+pub use host::search::HostSearch;
+pub use process::helpers::{self, Helpers};
+pub use process::realtime;
+pub use process::signals::hang_up;
 pub use recorder::Recording;
-pub use served::{Served, served};
-pub use signals::hang_up;
 pub use status::{socket_paths, trace_socket_paths};
-pub use terminal_group::{CLOSED, TerminalGroup};
+pub use transport::LinkName;
+pub use transport::can::{CanbusUuid, can_open, uuid as can_uuid};
+pub use transport::place::Place;
+pub use transport::pty::Access;
+pub use transport::served::{Served, served};
+pub use transport::stdio::give_back;
+pub use transport::terminal_group::{CLOSED, TerminalGroup};
+pub use trouble::started;
 
+use self::core::heartbeat::Pulse;
+use self::core::responses::LinkWake;
+use self::core::start::{CoreThread, REQUESTS};
+use self::core::wakeup::MarginLimits;
 use self::core::{Left, Request};
-use core_thread::{CoreThread, REQUESTS};
-use host_end::HostEnd;
-use introduction::Introduction;
-use link_thread::{End, LinkThread};
-use notify::Notify;
-use outlet::LinkWake;
-use oversight::Oversight;
-use pulse::Pulse;
-use realtime::{Processors, Role};
+use link::handshake::Introduction;
+use link::host_end::HostEnd;
+use link::oversight::Oversight;
+use link::thread::{End, LinkThread};
+use process::notify::{self, Notify};
+use process::realtime::{Processors, Role};
+use process::signals::Signals;
+use process::watchdog::{Vigil, Watchdog};
 use recorder::Recorder;
-use signals::Signals;
 use status::{Facts, HostBoard, StatusSocket};
-use wakeup::MarginLimits;
-use watchdog::{Vigil, Watchdog};
+use trouble::{no_room, refused};
 
 /// Version of the build.
 pub const VERSION: &str = env!("PINION_VERSION");
@@ -201,7 +182,7 @@ pub fn run(
     let (core, core_end) = core.start()?;
     started(recorder.start(trace_socket))?;
 
-    info!("{} {} ({})", link::serving(link.event().is_some()), link.place(), link.detail());
+    info!("{} {} ({})", transport::serving(link.event().is_some()), link.place(), link.detail());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
     let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);
@@ -266,30 +247,4 @@ fn end(
                 .remedy("start it anew, as the service does by itself"))
         }
     }
-}
-
-/// What to do if there can be no further process or thread.
-const NO_PROCESS: &str = "raise TasksMax or ulimit -u";
-
-/// The earlier of two times, if there is one.
-fn sooner(one: Option<Duration>, other: Option<Duration>) -> Option<Duration> {
-    match (one, other) {
-        (Some(one), Some(other)) => Some(one.min(other)),
-        (one, other) => one.or(other),
-    }
-}
-
-/// That the kernel refuses something, in its words.
-fn refused(what: impl fmt::Display, error: impl fmt::Display) -> Trouble {
-    Trouble::new(error.to_string()).of(what)
-}
-
-/// That there is no memory or descriptor for a part of the program.
-fn no_room(error: io::Error) -> Trouble {
-    refused("Pinion cannot be started", error).remedy("raise LimitNOFILE, or free memory")
-}
-
-/// Adds what to do about a thread that cannot be started.
-pub fn started<T>(thread: io::Result<T>) -> Result<T, Trouble> {
-    thread.map_err(|error| refused("no thread can be started", error).remedy(NO_PROCESS))
 }

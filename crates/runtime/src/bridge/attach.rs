@@ -19,10 +19,10 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{monotonic, poll_timeout};
 
-use super::super::link::stdio::Lent;
-use super::super::refused;
-use super::super::signals::hang_up;
 use super::{Flow, Heard, SILENCE_MAX, SYNC, Wire, read_some, write_some};
+use crate::process::signals::hang_up;
+use crate::transport::stdio::Lent;
+use crate::trouble::refused;
 
 /// How long the host's last bytes may wait for the MCU. A stop may be among them.
 const FAREWELL: Duration = Duration::from_secs(1);

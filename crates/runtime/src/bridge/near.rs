@@ -20,15 +20,15 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::{monotonic, poll_timeout};
 
-use super::super::link::Heard as FromHost;
-use super::super::link::Link;
-use super::super::link::pty::{Access, Pty};
-use super::super::notify::Notify;
-use super::super::signals::{Signal, Signals};
-use super::super::{no_room, refused};
 use super::round_trip::RoundTrips;
 use super::ssh::{Ssh, Target};
 use super::{Flow, Heard, SYNC};
+use crate::process::notify::Notify;
+use crate::process::signals::{Signal, Signals};
+use crate::transport::Heard as FromHost;
+use crate::transport::Link;
+use crate::transport::pty::{Access, Pty};
+use crate::trouble::{no_room, refused};
 
 /// The pauses between attempts to connect. Each is twice the one before.
 const PAUSE_MIN: Duration = Duration::from_secs(1);

@@ -17,8 +17,8 @@ use nix::unistd::Pid;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
-use super::super::refused;
 use super::{Heard, SILENCE_MAX, Wire, read_some};
+use crate::trouble::refused;
 
 /// ssh's options. It never asks a person. Its own packets for a network that has gone end it as soon as the bridge
 /// would. `ef` is for Wi-Fi: without a terminal ssh asks for the class of bulk data, which waits for all others.

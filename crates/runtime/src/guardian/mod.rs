@@ -50,10 +50,10 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{monotonic, wait_until};
 use pinion_linux::sys;
 
-use super::forked::THREADS_MAX;
-use super::pulse::{GuardianEar, Pulse};
-use super::recorder::Recording;
-use super::{NO_PROCESS, refused};
+use crate::core::heartbeat::{GuardianEar, Pulse};
+use crate::process::forked::THREADS_MAX;
+use crate::recorder::Recording;
+use crate::trouble::{NO_PROCESS, refused};
 
 use message::{Message, TAKEN};
 use watcher::{END_LIMIT, Program, Watcher};

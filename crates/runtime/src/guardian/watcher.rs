@@ -22,11 +22,11 @@ use nix::unistd::{Pid, alarm, getppid};
 use pinion_linux::clock::{monotonic, poll_timeout, wait_until};
 use pinion_linux::sys;
 
-use super::super::forked;
-use super::super::pulse::{Ear, Pulse};
-use super::super::realtime;
-use super::super::recorder::Recording;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
+use crate::core::heartbeat::{Ear, Pulse};
+use crate::process::forked;
+use crate::process::realtime;
+use crate::recorder::Recording;
 use pinion_trace::event::Event;
 use pinion_trace::file::End;
 

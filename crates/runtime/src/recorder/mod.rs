@@ -46,8 +46,8 @@ use pinion_trace::folder;
 use pinion_trace::ring::Writer;
 use pinion_trace::verdict::{Culprit, Verdict, verdict};
 
-use super::link::LinkName;
-use super::status::{Manners, Place, serve_on};
+use crate::status::{Manners, Place, serve_on};
+use crate::transport::LinkName;
 
 use computer::Computer;
 use edges::{EdgeBoard, EdgeTape};
@@ -89,7 +89,7 @@ impl Recording {
     ///
     /// The kernel has no memory for it.
     pub fn new(clock: Monotonic, link: &Path, realtime: bool, folders: Vec<PathBuf>) -> Result<Recording, Trouble> {
-        let memory = Memory::new().map_err(super::no_room)?;
+        let memory = Memory::new().map_err(crate::trouble::no_room)?;
         Ok(Recording { memory, clock, link: link.to_owned(), wire: None, realtime, folders })
     }
 

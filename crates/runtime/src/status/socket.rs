@@ -26,7 +26,6 @@ use pinion_linux::foreign::plain_json;
 use pinion_linux::own_folder::{OwnFolder, below};
 use pinion_trace::folder::name_of;
 
-use super::super::sooner;
 use super::Asker;
 use super::document::{Facts, HostBoard, Reporter};
 
@@ -244,7 +243,7 @@ fn serve(listener: &UnixListener, end: &PipeReader, manners: Manners, mut answer
         let reading = answers.iter().flat_map(|answer| &answer.clients);
         fds.extend(reading.map(|(client, _)| PollFd::new(client.as_fd(), PollFlags::POLLOUT)));
         let left = answers.front().map(|oldest| oldest.until.saturating_sub(now));
-        let _ = poll(&mut fds, sooner(pause, left).map_or(PollTimeout::NONE, poll_timeout));
+        let _ = poll(&mut fds, pause.into_iter().chain(left).min().map_or(PollTimeout::NONE, poll_timeout));
         if fds[0].any().unwrap_or(true) {
             return;
         }

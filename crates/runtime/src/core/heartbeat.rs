@@ -1,0 +1,628 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Signs of life, in a page of memory that the program and the guardian share. The page has the core's heartbeat, and
+//! the guardian's own sign. It also has the shutdown values that the MCU owes, and each worker's present job.
+//!
+//! A beat is the instant at which it was given. So a listener knows when silence began, and need not look more often
+//! than silence may last. The core sets that limit with each beat. It is about half a second while the MCU runs
+//! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Otherwise the outputs are at their start or shutdown values.
+//! Opening a device or ending a worker may then take its time.
+//!
+//! At a shutdown, workers write some of the outputs. Until they have done so, the MCU owes these shutdown values
+//! ([`Pulse::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
+//! core that hangs.
+//!
+//! The guardian in turn leaves a sign each time it listens. With [`GuardianEar`] the program notices a guardian that is
+//! stopped or hangs.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use nix::time::{ClockId, clock_gettime};
+
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::clock::{Monotonic, monotonic};
+use pinion_linux::sys::{self, SHARED_WORDS};
+use pinion_sync::life::{Heard, Heart, Slot};
+
+/// How long the core may be silent while the MCU runs.
+pub(crate) const RUNNING: Duration = Duration::from_millis(550);
+/// How long the core may be silent while the MCU is being configured or is shut down.
+const IDLE: Duration = Duration::from_secs(30);
+/// How long a shutdown value may be on its way to an output.
+const STOPPING: Duration = Duration::from_secs(1);
+/// How often an idle core beats. A beat may be late by the rest of [`RUNNING`].
+pub(crate) const BEAT: Duration = Duration::from_millis(300);
+/// How long the guardian may be silent while it holds outputs. It leaves a sign every [`RUNNING`].
+const GUARDIAN: Duration = Duration::from_secs(2);
+/// Shortest standstill after which a running MCU is stopped. The host's limits (max_duration) and the limits of late
+/// timers and steps handle shorter ones.
+const STANDSTILL: Duration = Duration::from_secs(1);
+
+/// Instants in the page are counted in 2^16 ticks, 1.3 ms: they wrap after 65 days.
+const STAMP_SHIFT: u32 = 16;
+const STANDSTILL_STAMPS: i32 = (STANDSTILL.as_nanos() / (NS_PER_TICK << STAMP_SHIFT) as u128) as i32;
+
+// The page's words.
+/// When the guardian last listened; 0 while it holds no outputs.
+const LISTENED_AT: usize = 0;
+/// Whether the guardian did not answer.
+const UNANSWERED: usize = 1;
+/// How long the computer was suspended. The core clears it when it has seen it.
+const SUSPENDED_MS: usize = 2;
+/// The first word of the core's heartbeat. It owes shutdown values.
+const HEART: usize = 5;
+/// The first word of the workers.
+const WORKERS: usize = 24;
+/// How many words a worker has: the start of its present job (0 without one), and the name of its bus.
+const SLOT_WORDS: usize = 8;
+
+/// The core's heartbeat, and the page itself.
+#[derive(Clone, Copy)]
+pub(crate) struct Pulse {
+    page: &'static [AtomicU32; SHARED_WORDS],
+    clock: Monotonic,
+}
+
+impl Pulse {
+    /// Gives a first beat now. `clock` is the core's.
+    pub(crate) fn new(clock: Monotonic) -> io::Result<Pulse> {
+        let pulse = Pulse { page: sys::shared_words()?, clock };
+        pulse.beat(clock.now(), false);
+        Ok(pulse)
+    }
+
+    /// The core is alive at `now`. `running`: its MCU is configured and not shut down. Only the core calls this.
+    #[inline]
+    pub(crate) fn beat(&self, now: Clock, running: bool) {
+        let silence_max = if running { RUNNING } else { IDLE };
+        self.heart().beat(stamp(now), silence_max.as_millis() as u32);
+    }
+
+    fn heart(&self) -> Heart<'static> {
+        Heart::new(&self.page[HEART..WORKERS])
+    }
+
+    /// Why a running MCU has to be stopped, if it stood still since the last beat. Its control group was frozen, or the
+    /// computer was suspended. Its outputs stayed as they were, and nobody knows the state of the parts that they heat
+    /// or move. The core asks before each beat.
+    #[inline]
+    pub(crate) fn standstill(&self, now: Clock) -> Option<Shutdown> {
+        let stamps = stamp(now).wrapping_sub(self.heart().own_beat()) as i32;
+        let stood_still = stamps >= STANDSTILL_STAMPS;
+        let suspended = self.page[SUSPENDED_MS].load(Ordering::Relaxed) != 0;
+        if stood_still || suspended { self.explain_standstill(now) } else { None }
+    }
+
+    #[cold]
+    fn explain_standstill(&self, now: Clock) -> Option<Shutdown> {
+        let suspended_ms = self.page[SUSPENDED_MS].swap(0, Ordering::Relaxed);
+        let ms = elapsed(self.heart().own_beat(), now).as_millis();
+        if self.heart().own_limit_ms() != RUNNING.as_millis() as u32 {
+            return None;
+        }
+        let trouble = match suspended_ms {
+            0 => Trouble::new(format!("Pinion stood still for {ms} ms")).remedy(
+                "was it stopped, its control group frozen, or the computer paused? FIRMWARE_RESTART starts anew",
+            ),
+            _ => Trouble::new(format!("the computer was suspended for {suspended_ms} ms with outputs in use"))
+                .remedy("keep it from that (systemctl mask sleep.target); FIRMWARE_RESTART starts anew"),
+        };
+        Some(Shutdown::because(reason::TIMER_PAST, trouble))
+    }
+
+    fn tell_suspension(&self, suspended: Duration) {
+        self.page[SUSPENDED_MS].store(suspended.as_millis() as u32, Ordering::Relaxed);
+    }
+
+    /// From now on the MCU owes the shutdown value of `subject`, such as `pwmchip0/pwm1`. The first call is a sign of
+    /// life at `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
+    /// replaces the subject, not the time. Only the core calls this.
+    pub(crate) fn owe(&self, subject: &str, now: Clock) {
+        self.heart().owe(subject, stamp(now));
+    }
+
+    /// Every output is at its shutdown value. This is a sign of life at `now`. Only the core calls this.
+    pub(crate) fn paid(&self, now: Clock) {
+        self.heart().paid(stamp(now));
+    }
+
+    /// The guardian did not answer the program, and counts as lost.
+    pub(crate) fn miss_answer(&self) {
+        self.page[UNANSWERED].store(1, Ordering::Relaxed);
+    }
+
+    /// The present instant of the core's clock.
+    pub(crate) fn now(&self) -> Clock {
+        self.clock.now()
+    }
+
+    /// Converts a time since the kernel's start to an instant of the core's clock.
+    pub(crate) fn at(&self, time: Duration) -> Clock {
+        let since = time.saturating_sub(self.clock.duration_of(Clock::EPOCH));
+        Clock::from_ticks(since.as_nanos() as u64 / NS_PER_TICK)
+    }
+
+    /// How long the core may be silent, and the time of its last beat.
+    fn listen(&self) -> (Duration, u32) {
+        let Heard { silence_max_ms, beat_at } = self.heart().listen();
+        (silence_max_ms.map_or(STOPPING, |ms| Duration::from_millis(ms.into())), beat_at)
+    }
+
+    /// Whether the heartbeat is missing at `now`.
+    pub(crate) fn is_silent(&self, now: Clock) -> bool {
+        let (silence_max, beat_at) = self.listen();
+        elapsed(beat_at, now) >= silence_max
+    }
+
+    /// For the log: the fault of a program that gave no sign of life.
+    pub(crate) fn diagnosis(&self) -> String {
+        let (silence_max, ms) = (self.heart().listen().silence_max_ms, self.listen().0.as_millis());
+        match silence_max {
+            Some(_) => format!("the core gave no sign of life for {ms} ms"),
+            None => format!(
+                "{} is not at its shutdown value within {ms} ms: check its power and wiring, and look at the kernel's log (dmesg)",
+                self.heart().subject().get()
+            ),
+        }
+    }
+
+    /// Words for a new worker. `None` if no words are left. Only the core calls this.
+    pub(crate) fn worker(&self, bus: &str) -> Option<JobClock> {
+        let slot = self.slots().find(|slot| !slot.name().is_set())?;
+        slot.name().set(bus);
+        Some(JobClock { slot, pulse: *self })
+    }
+
+    /// The bus of a worker whose present job takes longer than `limit` at `now`.
+    pub(crate) fn stuck(&self, now: Clock, limit: Duration) -> Option<String> {
+        let is_stuck = |slot: &Slot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
+        self.slots().find(is_stuck).map(|slot| slot.name().get())
+    }
+
+    fn slots(&self) -> impl Iterator<Item = Slot<'static>> {
+        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(Slot::new)
+    }
+}
+
+fn stamp(now: Clock) -> u32 {
+    (now.ticks() >> STAMP_SHIFT) as u32
+}
+
+/// The time from a stamp until `now`. Zero if the stamp was set meanwhile and is later than `now`.
+fn elapsed(since: u32, now: Clock) -> Duration {
+    let stamps = (stamp(now).wrapping_sub(since) as i32).max(0);
+    Duration::from_nanos(((stamps as u64) << STAMP_SHIFT) * NS_PER_TICK)
+}
+
+/// Shows others since when a worker is at its present job.
+pub(crate) struct JobClock {
+    slot: Slot<'static>,
+    pulse: Pulse,
+}
+
+impl JobClock {
+    /// A job begins.
+    pub(crate) fn begin(&self) {
+        self.slot.begin(stamp(self.pulse.now()));
+    }
+
+    /// The job ends.
+    pub(crate) fn end(&self) {
+        self.slot.end();
+    }
+}
+
+impl Drop for JobClock {
+    fn drop(&mut self) {
+        self.slot.free();
+    }
+}
+
+/// Longest oversleep that counts as listening. After a longer one, only this much of the sleep counts.
+const OVERSLEPT: Duration = Duration::from_millis(100);
+
+/// How long a sign of life is missing. Silence counts only while the listener itself was awake. Both processes may
+/// stand still together, as in a frozen control group. Then neither one believes that the other hangs.
+struct Silence {
+    /// The last sign that was heard.
+    heard: u32,
+    length: Duration,
+    looked: Clock,
+    /// How long the listener meant to sleep then.
+    pause: Duration,
+}
+
+impl Silence {
+    /// No silence so far. The sign is `sign` at `now`.
+    fn new(sign: u32, now: Clock) -> Silence {
+        Silence { heard: sign, length: Duration::ZERO, looked: now, pause: Duration::ZERO }
+    }
+
+    /// Takes in that the sign is `sign` at `now`. Returns how long not to look again, at most `longest`. `None` if the
+    /// sign has been missing for `silence_max`.
+    fn listen(&mut self, sign: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
+        let slept = Duration::from_nanos(now.since(self.looked).max(0) as u64 * NS_PER_TICK);
+        let listened = if slept > self.pause + OVERSLEPT { OVERSLEPT } else { slept };
+        self.length = if sign == self.heard { self.length + listened } else { elapsed(sign, now).min(listened) };
+        let left = silence_max.checked_sub(self.length).filter(|left| !left.is_zero())?;
+        self.pause = left.min(longest);
+        (self.heard, self.looked) = (sign, now);
+        Some(self.pause)
+    }
+}
+
+/// The guardian's ear. It listens to the heartbeat, and leaves a sign of its own each time. It lives as long as the
+/// guardian holds outputs.
+pub(crate) struct Ear {
+    pulse: Pulse,
+    silence: Silence,
+    suspensions: Suspensions,
+}
+
+impl Ear {
+    /// Listens from `now` on.
+    pub(crate) fn new(pulse: Pulse, now: Clock) -> Ear {
+        let (_, beat_at) = pulse.listen();
+        Ear { pulse, silence: Silence::new(beat_at, now), suspensions: Suspensions::new() }
+    }
+
+    /// How long not to look again. `None` if the heartbeat is missing at `now`.
+    pub(crate) fn listen(&mut self, now: Clock) -> Option<Duration> {
+        self.pulse.page[LISTENED_AT].store(stamp(now).max(1), Ordering::Relaxed);
+        if let Some(suspended) = self.suspensions.newest() {
+            self.pulse.tell_suspension(suspended);
+        }
+        let (silence_max, beat_at) = self.pulse.listen();
+        // No longer than the limit of a running MCU: by then the core may have begun to run.
+        self.silence.listen(beat_at, now, silence_max, RUNNING)
+    }
+}
+
+impl Drop for Ear {
+    fn drop(&mut self) {
+        self.pulse.page[LISTENED_AT].store(0, Ordering::Relaxed);
+    }
+}
+
+/// Notices that the computer was suspended. CLOCK_BOOTTIME counts that time. CLOCK_MONOTONIC does not, and everything
+/// else here uses it.
+struct Suspensions {
+    /// How far CLOCK_BOOTTIME is ahead, as measured.
+    ahead: Duration,
+}
+
+/// Highest difference that the clocks' resolution may cause.
+const SUSPENSION_MIN: Duration = Duration::from_millis(1);
+
+impl Suspensions {
+    fn new() -> Suspensions {
+        // A process that is kept from running between two readings reads the second clock too late. That makes the
+        // difference too large here, and too small below. So neither looks like a suspension.
+        let before = monotonic();
+        Suspensions { ahead: boottime().saturating_sub(before) }
+    }
+
+    /// How long the computer was suspended since the last call.
+    fn newest(&mut self) -> Option<Duration> {
+        let boottime = boottime();
+        self.grown_to(boottime.saturating_sub(monotonic()))
+    }
+
+    fn grown_to(&mut self, ahead: Duration) -> Option<Duration> {
+        let suspended = ahead.checked_sub(self.ahead).filter(|suspended| *suspended >= SUSPENSION_MIN)?;
+        self.ahead = ahead;
+        Some(suspended)
+    }
+}
+
+fn boottime() -> Duration {
+    // clock_gettime(2) fails for an unknown clock or a bad pointer only.
+    clock_gettime(ClockId::CLOCK_BOOTTIME).map_or(Duration::ZERO, Duration::from)
+}
+
+/// The program's ear. It listens to the guardian's sign of life while the guardian holds outputs.
+pub(crate) struct GuardianEar {
+    pulse: Pulse,
+    silence: Option<Silence>,
+    due: Duration,
+}
+
+impl GuardianEar {
+    pub(crate) fn new(pulse: Pulse) -> GuardianEar {
+        GuardianEar { pulse, silence: None, due: Duration::ZERO }
+    }
+
+    /// When to look next (CLOCK_MONOTONIC). `None` while the guardian holds nothing.
+    pub(crate) fn due(&self) -> Option<Duration> {
+        let is_set = |word: usize| self.pulse.page[word].load(Ordering::Relaxed) != 0;
+        if is_set(UNANSWERED) {
+            return Some(Duration::ZERO);
+        }
+        is_set(LISTENED_AT).then_some(self.due)
+    }
+
+    /// Whether the guardian is lost at `now`: it did not answer, or has been silent for
+    /// [`GUARDIAN`].
+    pub(crate) fn is_lost(&mut self, now: Duration) -> bool {
+        if self.pulse.page[UNANSWERED].load(Ordering::Relaxed) != 0 {
+            return true;
+        }
+        let sign = self.pulse.page[LISTENED_AT].load(Ordering::Relaxed);
+        if sign == 0 || now < self.due {
+            return false;
+        }
+        let clock = self.pulse.at(now);
+        let silence = self.silence.get_or_insert_with(|| Silence::new(sign, clock));
+        let pause = silence.listen(sign, clock, GUARDIAN, GUARDIAN);
+        self.due = now + pause.unwrap_or_default();
+        pause.is_none()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::time::{CLOCK_FREQ, Ticks};
+
+    /// Highest difference that the stamps' resolution may cause.
+    const FINE: Duration = Duration::from_millis(2);
+
+    fn at(ms: u64) -> Clock {
+        Clock::from_ticks(ms * u64::from(CLOCK_FREQ) / 1000)
+    }
+
+    fn pulse() -> Pulse {
+        let pulse = Pulse::new(Monotonic::start()).unwrap();
+        pulse.beat(at(0), false);
+        pulse
+    }
+
+    /// After how many milliseconds a punctual listener hears that the heartbeat is missing, and how often it looked.
+    fn silent_after(ear: &mut Ear, from_ms: u64) -> (u64, u32) {
+        let (mut ms, mut looks) = (from_ms, 0);
+        while let Some(pause) = ear.listen(at(ms)) {
+            ms += pause.as_millis().max(1) as u64;
+            looks += 1;
+            assert!(looks < 1000);
+        }
+        (ms - from_ms, looks)
+    }
+
+    #[test]
+    fn a_core_that_beats_is_not_silent_and_seldom_looked_for() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        let (mut look_ms, mut looks) = (0, 0);
+        for ms in 0..60_000 {
+            // As late as a core may be.
+            if ms % 540 == 0 {
+                pulse.beat(at(ms), true);
+            }
+            if ms >= look_ms {
+                look_ms = ms + ear.listen(at(ms)).unwrap_or_else(|| panic!("silent at {ms} ms")).as_millis() as u64 + 1;
+                looks += 1;
+            }
+        }
+        assert!(looks < 300, "{looks} looks in a minute");
+        for ms in (60_000..120_000).step_by(BEAT.as_millis() as usize) {
+            pulse.beat(at(ms), true);
+            assert!(!pulse.is_silent(at(ms + 500)));
+        }
+    }
+
+    #[test]
+    fn a_running_core_is_missed_before_600_ms_are_over() {
+        for beat_ms in [0, 1, 150, 299, 549] {
+            let pulse = pulse();
+            let mut ear = Ear::new(pulse, at(0));
+            pulse.beat(at(0), true);
+            ear.listen(at(0)).unwrap();
+            pulse.beat(at(beat_ms), true);
+            let (after, looks) = silent_after(&mut ear, 550);
+            let silence = Duration::from_millis(550 + after - beat_ms);
+            assert!(silence + FINE >= RUNNING && silence <= RUNNING + FINE, "{silence:?}");
+            assert!(looks <= 3, "{looks} looks");
+            assert!(pulse.is_silent(at(550 + after) + Ticks::from_ms(2)));
+        }
+    }
+
+    #[test]
+    fn an_mcu_that_begins_to_run_is_watched_closely_at_once() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        let pause = ear.listen(at(0)).unwrap();
+        pulse.beat(at(1), true);
+        let (after, _) = silent_after(&mut ear, pause.as_millis() as u64);
+        assert!(pause.as_millis() as u64 + after <= 555);
+    }
+
+    #[test]
+    fn a_core_that_is_configured_may_take_its_time() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        let (after, _) = silent_after(&mut ear, 0);
+        assert!((29_990..30_010).contains(&after), "{after} ms");
+        assert_eq!(pulse.diagnosis(), "the core gave no sign of life for 30000 ms");
+    }
+
+    #[test]
+    fn what_the_listener_slept_through_is_no_silence() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        pulse.beat(at(0), true);
+        ear.listen(at(0)).unwrap();
+        pulse.beat(at(290), true);
+        ear.listen(at(550)).unwrap();
+        // The computer stood still for a minute, and the core is not awake yet.
+        let pause = ear.listen(at(60_000)).expect("it was not heard");
+        assert!(pause >= Duration::from_millis(150), "{pause:?}");
+        // A listener that never gets its turn in time still hears a core that hangs.
+        let looks = (61..80).take_while(|s| ear.listen(at(s * 1000)).is_some()).count();
+        assert!((1..4).contains(&looks), "{looks}");
+    }
+
+    #[test]
+    fn a_shutdown_value_that_is_owed_stops_the_heart() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        pulse.beat(at(0), true);
+        ear.listen(at(0)).unwrap();
+        pulse.owe("spi0", at(0));
+        for ms in (0..=900).step_by(100) {
+            // The core itself continues.
+            pulse.beat(at(ms), false);
+            assert!(ear.listen(at(ms)).is_some(), "{ms} ms");
+        }
+        // The first output has its value, and another has not: the time goes on.
+        pulse.owe("pwmchip10/pwm1", at(950));
+        pulse.beat(at(1000), false);
+        let (after, _) = silent_after(&mut ear, 901);
+        assert!((98..=103).contains(&after), "{after} ms");
+        let diagnosis = "pwmchip10/pwm1 is not at its shutdown value within 1000 ms: ";
+        assert!(pulse.diagnosis().starts_with(diagnosis), "{}", pulse.diagnosis());
+        // It was only slow.
+        pulse.paid(at(1010));
+        assert!(ear.listen(at(1010)).is_some());
+        assert_eq!(pulse.listen().0, IDLE);
+    }
+
+    #[test]
+    fn what_the_core_was_at_before_the_mcu_owed_anything_does_not_count() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        // The core fails to open a device, and the MCU stops.
+        for ms in (0..4000).step_by(500) {
+            assert!(ear.listen(at(ms)).is_some());
+        }
+        pulse.owe("pwmchip0/pwm0", at(4000));
+        let (after, _) = silent_after(&mut ear, 4000);
+        assert!((998..=1003).contains(&after), "{after} ms");
+    }
+
+    #[test]
+    fn a_running_mcu_that_stood_still_is_told_so_once() {
+        let pulse = pulse();
+        pulse.beat(at(0), true);
+        assert!(pulse.standstill(at(990)).is_none());
+        let shutdown = pulse.standstill(at(1010)).unwrap();
+        assert_eq!(shutdown.reason, reason::TIMER_PAST);
+        assert!(shutdown.trouble.cause.contains("stood still for 10"), "{shutdown}");
+        pulse.beat(at(1010), true);
+        assert!(pulse.standstill(at(1011)).is_none());
+        // An MCU that is being configured may take its time, and reports nothing.
+        pulse.beat(at(1010), false);
+        assert!(pulse.standstill(at(9000)).is_none());
+    }
+
+    #[test]
+    fn a_running_mcu_that_was_suspended_is_told_so_once() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        pulse.beat(at(0), true);
+        ear.listen(at(0)).unwrap();
+        assert!(pulse.standstill(at(1)).is_none(), "this computer was not suspended meanwhile");
+        pulse.tell_suspension(Duration::from_secs(60));
+        let shutdown = pulse.standstill(at(3)).unwrap();
+        assert!(shutdown.trouble.cause.contains("suspended for 60000 ms"), "{shutdown}");
+        assert!(pulse.standstill(at(4)).is_none());
+    }
+
+    #[test]
+    fn a_suspension_is_what_one_clock_is_ahead_of_the_other() {
+        let s = Duration::from_secs;
+        let mut suspensions = Suspensions { ahead: s(10) };
+        assert_eq!(suspensions.grown_to(s(10)), None);
+        // The process did not run between two readings.
+        assert_eq!(suspensions.grown_to(s(8)), None);
+        assert_eq!(suspensions.grown_to(s(15)), Some(s(5)));
+        assert_eq!(suspensions.grown_to(s(15)), None);
+    }
+
+    /// A time of CLOCK_MONOTONIC.
+    fn time(pulse: Pulse, ms: u64) -> Duration {
+        pulse.clock.duration_of(at(ms))
+    }
+
+    /// The core's beat and the guardian's look, at each instant of `ms`.
+    fn listen_at(ear: &mut Ear, ms: impl IntoIterator<Item = u64>) {
+        for ms in ms {
+            ear.pulse.beat(at(ms), true);
+            ear.listen(at(ms)).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_guardian_that_holds_outputs_is_missed_after_two_seconds() {
+        let pulse = pulse();
+        let mut program = GuardianEar::new(pulse);
+        assert_eq!(program.due(), None, "it holds nothing");
+        let mut guardian = Ear::new(pulse, at(0));
+        listen_at(&mut guardian, [0]);
+        let (mut ms, mut looks) = (0, 0);
+        // It listens until the tenth second, then it is stopped.
+        let lost_at = loop {
+            assert!(ms < 20_000, "it is not missed");
+            if ms % 500 == 0 && ms <= 10_000 {
+                listen_at(&mut guardian, [ms]);
+            }
+            if program.due().is_some_and(|due| time(pulse, ms) >= due) {
+                looks += 1;
+                if program.is_lost(time(pulse, ms)) {
+                    break ms;
+                }
+            }
+            ms += 10;
+        };
+        assert!((12_000..=12_020).contains(&lost_at), "{lost_at} ms");
+        assert!(looks < 12, "{looks} looks");
+        drop(guardian);
+        assert_eq!(program.due(), None);
+    }
+
+    #[test]
+    fn a_guardian_that_stood_still_together_with_the_program_is_not_missed() {
+        let pulse = pulse();
+        let mut program = GuardianEar::new(pulse);
+        let mut guardian = Ear::new(pulse, at(0));
+        listen_at(&mut guardian, (0..=5000).step_by(500));
+        assert!(!program.is_lost(time(pulse, 5100)));
+        // Both are frozen for a minute, and the program continues first.
+        assert!(!program.is_lost(time(pulse, 65_000)));
+        assert!(program.due().unwrap() > time(pulse, 66_000));
+        listen_at(&mut guardian, [65_010]);
+        assert!(!program.is_lost(program.due().unwrap()));
+    }
+
+    #[test]
+    fn a_guardian_that_does_not_answer_is_lost_at_once() {
+        let pulse = pulse();
+        let mut program = GuardianEar::new(pulse);
+        pulse.miss_answer();
+        assert_eq!(program.due(), Some(Duration::ZERO));
+        assert!(program.is_lost(time(pulse, 1)));
+    }
+
+    #[test]
+    fn workers_come_and_go() {
+        let pulse = pulse();
+        let places = (SHARED_WORDS - WORKERS) / SLOT_WORDS;
+        for round in 0..2 {
+            let workers: Vec<_> = (0..places).map(|n| pulse.worker(&format!("spi{n}")).unwrap()).collect();
+            assert!(pulse.worker("spi").is_none(), "round {round}");
+            workers[3].begin();
+            let now = pulse.now();
+            let later = pulse.at(pinion_linux::clock::monotonic() + Duration::from_secs(11));
+            assert_eq!(pulse.stuck(now, Duration::from_secs(10)), None);
+            assert_eq!(pulse.stuck(later, Duration::from_secs(10)).as_deref(), Some("spi3"));
+            workers[3].end();
+            assert_eq!(pulse.stuck(later, Duration::from_secs(10)), None);
+        }
+        let long = pulse.worker("a bus whose name is longer than is shown").unwrap();
+        assert_eq!(long.slot.name().get(), "a bus whose name is longer t");
+    }
+}

@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The core's thread: its scheduling, and its rings to the link.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+
+use log::warn;
+use rtrb::RingBuffer;
+
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::{Dialect, Mcu};
+use pinion_firmware::time::Timing;
+use pinion_firmware::trouble::Trouble;
+use pinion_sync::calls::Progress;
+
+use crate::core::heartbeat::Pulse;
+use crate::core::responses::{self, LinkWake};
+use crate::core::wakeup::{MarginLimits, Waiter};
+use crate::core::workers::Threads;
+use crate::core::{Core, Left, Parts};
+use crate::link::core_end::CoreEnd;
+use crate::link::ledger::Ledger;
+use crate::process::realtime::{self, Processors, Role, Scheduling};
+use crate::recorder::{Recording, Tape};
+use crate::status::Teller;
+use crate::trouble::started;
+
+/// Highest number of blocks between link and core: four times the blocks that a host may have under way.
+pub(crate) const REQUESTS: usize = 256;
+
+/// Everything that the core's thread needs.
+pub(crate) struct CoreThread {
+    pub(crate) board: Box<dyn Board>,
+    pub(crate) timing: Timing,
+    /// The dialect that the MCU speaks before a host comes.
+    pub(crate) dialect: Arc<Dialect>,
+    pub(crate) wake: Arc<LinkWake>,
+    pub(crate) pulse: Pulse,
+    pub(crate) teller: Teller,
+    pub(crate) recording: Recording,
+    pub(crate) tape: Tape,
+    pub(crate) processors: Processors,
+    pub(crate) margin: MarginLimits,
+    pub(crate) realtime: bool,
+}
+
+impl CoreThread {
+    /// Starts the thread, and returns the link's end of it.
+    pub(crate) fn start(self) -> Result<(JoinHandle<Left>, CoreEnd), Trouble> {
+        let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
+        let (outlet, inlet) = responses::outlet(wake.clone(), progress.clone());
+        let (requests, inbox) = RingBuffer::new(REQUESTS);
+        // Count the processors before the core is confined to one.
+        let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+        let core_progress = progress.clone();
+        let core = started(thread::Builder::new().name("core".into()).spawn(move || {
+            let CoreThread {
+                board,
+                timing,
+                dialect,
+                wake,
+                pulse,
+                teller,
+                recording,
+                tape,
+                processors,
+                margin,
+                realtime,
+            } = self;
+            if let Err(error) = processors.confine() {
+                warn!(
+                    "--cpu: the core is not bound to its processor, and runs on any: {error}: choose another processor"
+                );
+            }
+            let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
+            let prepare = Arc::new(move || {
+                // A thread inherits the processors of the thread that starts it.
+                processors.free();
+                if realtime {
+                    realtime::enter(Role::Worker);
+                }
+            });
+            let clock = timing.clock.clone();
+            let workers = Threads::new(thread::current(), prepare, clock.clone(), pulse, recording, may_poll);
+            let mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(outlet));
+            let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
+            let (requests, progress) = (inbox, core_progress);
+            Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll }).run()
+        }))?;
+        let thread = core.thread().clone();
+        let ledger = Ledger::default();
+        Ok((core, CoreEnd { requests, thread, inlet, progress, wake, ledger, may_poll }))
+    }
+}

@@ -1,0 +1,395 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Workers: each bus has a thread that runs the errands to the bus's devices, one after the other. So the core never
+//! waits for a device.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle, Thread};
+use std::time::Duration;
+
+use log::error;
+use rtrb::{Consumer, Producer, PushError, RingBuffer};
+
+use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::clock::{monotonic, wait_until};
+
+use pinion_trace::event::Event;
+use pinion_trace::ring::Writer;
+
+use crate::core::busy_poll::Lookout;
+use crate::core::heartbeat::{JobClock, Pulse};
+use crate::recorder::{Recording, span};
+
+/// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
+const QUEUE_JOBS: usize = 1024;
+/// How long a worker polls for the next job after a job that a command waited for. The core runs the next command
+/// within microseconds, if the host has sent it already.
+const NEXT_JOB: Ticks = Ticks::from_us(50);
+/// How long to wait for workers to end. Most drivers give up a silent chip within this time.
+const END_LIMIT: Duration = Duration::from_secs(2);
+
+struct Worker {
+    bus: String,
+    /// The jobs, and when they were submitted.
+    jobs: Producer<(Job, Clock)>,
+    done: Consumer<Completion>,
+    quit: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+    /// Nobody waits for its end.
+    left_behind: bool,
+}
+
+/// The thread of each new worker calls this first.
+pub(crate) type Prepare = Arc<dyn Fn() + Send + Sync>;
+
+/// The workers of an MCU. Each one starts when the first device of its bus is opened.
+pub(crate) struct Threads {
+    core: Thread,
+    prepare: Prepare,
+    clock: Arc<dyn TimeSource>,
+    pulse: Pulse,
+    recording: Recording,
+    may_poll: bool,
+    workers: Vec<Worker>,
+}
+
+impl Threads {
+    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `pulse` since when it runs the
+    /// errand. It records its errands in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
+    pub(crate) fn new(
+        core: Thread,
+        prepare: Prepare,
+        clock: Arc<dyn TimeSource>,
+        pulse: Pulse,
+        recording: Recording,
+        may_poll: bool,
+    ) -> Threads {
+        Threads { core, prepare, clock, pulse, recording, may_poll, workers: Vec::new() }
+    }
+
+    fn spawn(&self, bus: &str) -> Result<Worker, Shutdown> {
+        let (jobs, inbox) = RingBuffer::new(QUEUE_JOBS);
+        let (outbox, done) = RingBuffer::new(QUEUE_JOBS);
+        let quit = Arc::new(AtomicBool::new(false));
+        let shown = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
+        let core = self.core.clone();
+        let clock = self.clock.clone();
+        let lookout = Lookout::new(self.may_poll, clock.now());
+        let tape = self.recording.worker(bus);
+        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, lookout, tape };
+        let prepare = self.prepare.clone();
+        let thread = thread::Builder::new()
+            .name(bus.into())
+            .spawn(move || {
+                prepare();
+                server.run();
+            })
+            .map_err(|error| {
+                let trouble = Trouble::new(format!("its thread cannot be started ({error})"));
+                overflow(bus, trouble.remedy("raise TasksMax or ulimit -u"))
+            })?;
+        Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })
+    }
+}
+
+/// The remedy for an error that should not be possible.
+const REPORT: &str = "please report it";
+
+fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
+    Shutdown::because(reason::WORKER_OVERFLOW, why.into().of(format_args!("the worker of {bus}")))
+}
+
+impl Workers for Threads {
+    fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
+        if let Some(worker) = self.workers.iter().position(|worker| worker.bus == bus) {
+            return Ok(WorkerId(worker));
+        }
+        self.workers.push(self.spawn(bus)?);
+        Ok(WorkerId(self.workers.len() - 1))
+    }
+
+    fn are_parallel(&self) -> bool {
+        self.may_poll
+    }
+
+    fn leave_behind(&mut self, WorkerId(worker): WorkerId) {
+        if let Some(worker) = self.workers.get_mut(worker) {
+            worker.left_behind = true;
+        }
+    }
+
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+        let Some(worker) = self.workers.get_mut(worker) else {
+            let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
+            return Err(Refused { job, why });
+        };
+        if let Err(PushError::Full((job, _))) = worker.jobs.push((job, self.clock.now())) {
+            let trouble = Trouble::new("more is asked of it at once than there are devices");
+            let why = overflow(&worker.bus, trouble.remedy(REPORT));
+            return Err(Refused { job, why });
+        }
+        worker.thread.thread().unpark();
+        Ok(())
+    }
+
+    fn completion(&mut self) -> Option<Completion> {
+        self.workers.iter_mut().find_map(|worker| worker.done.pop().ok())
+    }
+
+    fn has_completion(&self) -> bool {
+        self.workers.iter().any(|worker| !worker.done.is_empty())
+    }
+
+    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
+        self.workers.iter().for_each(|worker| each(&worker.bus, QUEUE_JOBS - worker.jobs.slots()));
+    }
+
+    /// Waits up to two seconds until the workers have done the submitted jobs. Only then are their devices free to be
+    /// opened again. A worker that hangs is left behind, with its devices.
+    fn reset(&mut self) {
+        for worker in &self.workers {
+            worker.quit.store(true, Ordering::Release);
+            worker.thread.thread().unpark();
+        }
+        let end = monotonic() + END_LIMIT;
+        for worker in self.workers.drain(..).filter(|worker| !worker.left_behind) {
+            if wait_until(end, || worker.thread.is_finished()) {
+                let _ = worker.thread.join();
+            } else {
+                error!(
+                    "{} does not answer, and its pins and devices stay in use: its driver or chip hangs: look at the kernel's log (dmesg), then restart Pinion",
+                    worker.bus
+                );
+            }
+        }
+    }
+}
+
+impl Drop for Threads {
+    fn drop(&mut self) {
+        self.reset();
+    }
+}
+
+/// A worker's thread.
+struct Server {
+    jobs: Consumer<(Job, Clock)>,
+    done: Producer<Completion>,
+    quit: Arc<AtomicBool>,
+    core: Thread,
+    clock: Arc<dyn TimeSource>,
+    shown: JobClock,
+    lookout: Lookout,
+    tape: Option<Writer>,
+}
+
+impl Server {
+    fn run(mut self) {
+        loop {
+            // Read this before the queue. Then a job that was submitted before `quit` was set is seen and still done.
+            // It may switch an output off.
+            let ending = self.quit.load(Ordering::Acquire);
+            // This worker was left behind. Another worker has its jobs now, and its devices are wanted.
+            if self.jobs.is_abandoned() {
+                return;
+            }
+            match self.jobs.pop() {
+                Ok((job, submitted)) => self.serve(job, submitted),
+                Err(_) if ending => return,
+                Err(_) if self.lookout.goes_on(self.clock.now()) => thread::yield_now(),
+                Err(_) => thread::park(),
+            }
+        }
+    }
+
+    fn serve(&mut self, job: Job, submitted: Clock) {
+        let Job { oid, mut parcel, holds } = job;
+        self.shown.begin();
+        let began = self.clock.now();
+        let number = oid.number();
+        self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
+        let ended = self.clock.errand(&mut || parcel.run());
+        self.shown.end();
+        self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
+        // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
+        let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
+        // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
+        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds)) {
+            self.core.unpark();
+        }
+        // Samples, which timers ask for, come at their own pace.
+        if holds {
+            self.lookout.expect(ended, NEXT_JOB);
+        }
+    }
+
+    fn record(&mut self, at: Clock, event: Event) {
+        if let Some(tape) = &mut self.tape {
+            tape.write(at, event);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::mcu::{Oid, Parcel};
+    use pinion_linux::clock::Monotonic;
+    use std::sync::atomic::AtomicU64;
+    use std::sync::mpsc::{self, Receiver, Sender};
+
+    /// Waits until it may continue, then reports its number.
+    struct Slow {
+        go_on: Arc<std::sync::Mutex<Receiver<()>>>,
+        number: u8,
+        said: Sender<u8>,
+    }
+
+    impl Parcel for Slow {
+        fn run(&mut self) {
+            let _ = self.go_on.lock().unwrap().recv();
+            let _ = self.said.send(self.number);
+        }
+    }
+
+    /// A clock on which each look takes a microsecond.
+    #[derive(Default)]
+    struct Looks(AtomicU64);
+
+    impl TimeSource for Looks {
+        fn now(&self) -> Clock {
+            Clock::from_ticks((self.0.fetch_add(1, Ordering::Relaxed) + 1) * u64::from(Ticks::from_us(1).0))
+        }
+
+        fn instant_of(&self, _monotonic: Duration) -> Clock {
+            self.now()
+        }
+
+        fn duration_of(&self, _clock: Clock) -> Duration {
+            Duration::ZERO
+        }
+    }
+
+    struct Quick;
+
+    impl Parcel for Quick {
+        fn run(&mut self) {}
+    }
+
+    fn submit(threads: &mut Threads, worker: WorkerId, parcel: Box<dyn Parcel>, holds: bool) {
+        let taken = threads.submit(worker, Job { oid: Oid::new(0), parcel, holds });
+        assert!(taken.is_ok());
+    }
+
+    /// How often a worker reads its clock after it got a job, until it sleeps.
+    fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
+        let clock = Arc::new(Looks::default());
+        let pulse = Pulse::new(Monotonic::start()).unwrap();
+        let mut threads =
+            Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, Recording::of_a_test(), may_poll);
+        let worker = threads.start("spi0").unwrap();
+        // It reads the clock once when it falls asleep.
+        let asleep = || {
+            let mut before = 0;
+            loop {
+                thread::sleep(Duration::from_millis(50));
+                let looks = clock.0.load(Ordering::Relaxed);
+                if looks == before {
+                    return looks;
+                }
+                before = looks;
+            }
+        };
+        let before = asleep();
+        submit(&mut threads, worker, Box::new(Quick), holds);
+        while threads.completion().is_none() {
+            thread::yield_now();
+        }
+        asleep() - before
+    }
+
+    #[test]
+    fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
+        // One look when the job is submitted, one when it begins, one when it ends, and one before the worker sleeps.
+        assert_eq!(looks_after_a_job(false, true), 4);
+        assert_eq!(looks_after_a_job(true, false), 4);
+        assert_eq!(looks_after_a_job(true, true), 3 + u64::from(NEXT_JOB.0 / Ticks::from_us(1).0));
+    }
+
+    fn threads() -> Threads {
+        let clock = Monotonic::start();
+        {
+            let pulse = Pulse::new(clock).unwrap();
+            Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), pulse, Recording::of_a_test(), true)
+        }
+    }
+
+    #[test]
+    fn what_was_asked_for_before_the_end_is_done_in_order() {
+        let (release, go_on) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("pwm").unwrap();
+        assert_eq!(threads.start("pwm").unwrap(), worker);
+        for number in 0..5 {
+            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
+            submit(&mut threads, worker, Box::new(slow), false);
+        }
+        drop(release);
+        threads.reset();
+        drop(said);
+        assert_eq!(heard.iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
+    }
+
+    #[test]
+    fn a_worker_that_hangs_is_left_behind_and_lets_go_of_all_once_it_is_back() {
+        let (release, go_on) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("i2c1").unwrap();
+        for number in 0..2 {
+            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
+            submit(&mut threads, worker, Box::new(slow), false);
+        }
+        drop(said);
+        threads.reset();
+        assert!(!threads.has_completion());
+        // Another one takes its place.
+        threads.start("i2c1").unwrap();
+        drop(release);
+        // This ends when both errands are dropped. The second one is not begun.
+        assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
+    }
+
+    #[test]
+    fn a_worker_that_only_reads_is_not_waited_for() {
+        let (release, go_on) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("w1 28-1").unwrap();
+        threads.leave_behind(worker);
+        let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
+        submit(&mut threads, worker, Box::new(Slow { go_on, number: 7, said }), false);
+        // A job that is not under way yet would be dropped.
+        while waiting(&threads) > 0 {
+            thread::sleep(Duration::from_millis(1));
+        }
+        let began = monotonic();
+        threads.reset();
+        assert!(monotonic() - began < END_LIMIT, "it was waited for");
+        assert!(heard.try_recv().is_err());
+        // It continues, and nobody gets its result.
+        threads.start("w1 28-1").unwrap();
+        drop(release);
+        assert_eq!(heard.recv(), Ok(7));
+        assert!(!threads.has_completion());
+    }
+}

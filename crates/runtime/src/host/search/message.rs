@@ -1,0 +1,158 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The messages between the program and the search for the host. Their socket (SOCK_SEQPACKET) keeps each message in
+//! one piece. Each is JSON.
+//!
+//! The search reads files that a host has written. So the program trusts none of its messages: [`Answer::decode`] takes
+//! nothing that is too long or not an answer.
+
+#![forbid(unsafe_code)]
+
+use serde::{Deserialize, Serialize};
+
+use crate::host::klippy::process::Terminal;
+use pinion_firmware::mcu::DialectName;
+use pinion_linux::foreign::plain;
+
+use crate::status::FoundHost;
+
+/// Longest message in either direction. The longest texts of an answer fit.
+pub(super) const MESSAGE_BYTES_MAX: usize = 64 * 1024;
+/// Highest number of lines in an answer, longest text of a line, and longest path.
+const LINES_MAX: usize = 6;
+const LINE_CHARS_MAX: usize = 1000;
+const PATH_CHARS_MAX: usize = 1000;
+
+/// The program's question: who has this terminal open?
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Question {
+    /// The answer has the same number.
+    pub(super) number: u32,
+    pub(super) terminal: Terminal,
+}
+
+/// The first message of the search.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Hello {
+    /// Why the kernel does not confine the search, if it does not.
+    pub(super) unconfined: Option<String>,
+}
+
+/// A line for the log.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Line {
+    pub(super) is_warning: bool,
+    pub(super) text: String,
+}
+
+/// The search's answer.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Answer {
+    pub(super) number: u32,
+    /// Written as [`DialectName`] writes it.
+    dialect: String,
+    pub(super) host: Option<FoundHost>,
+    pub(super) lines: Vec<Line>,
+}
+
+/// A text without control characters that is not too long for the log.
+fn bounded(text: &str, chars_max: usize) -> String {
+    let text = plain(text);
+    match text.chars().count() <= chars_max {
+        true => text.into_owned(),
+        false => text.chars().take(chars_max - 1).chain(['…']).collect(),
+    }
+}
+
+impl Answer {
+    pub(super) fn new(number: u32, dialect: DialectName, host: Option<FoundHost>, lines: Vec<Line>) -> Answer {
+        Answer { number, dialect: dialect.to_string(), host, lines }.bounded()
+    }
+
+    /// The dialect. It is the union, which most hosts accept, if this program does not know it.
+    pub(super) fn dialect(&self) -> DialectName {
+        self.dialect.parse().unwrap_or(DialectName::Union)
+    }
+
+    /// The same answer without anything that is too long or may not be shown.
+    fn bounded(mut self) -> Answer {
+        self.lines.truncate(LINES_MAX);
+        for line in &mut self.lines {
+            line.text = bounded(&line.text, LINE_CHARS_MAX);
+        }
+        if let Some(host) = &mut self.host {
+            host.checkout = host.checkout.as_ref().map(|path| bounded(path, PATH_CHARS_MAX));
+            host.commit.take_if(|commit| commit.len() > 40 || !commit.bytes().all(|byte| byte.is_ascii_hexdigit()));
+        }
+        self
+    }
+
+    /// The answer in these bytes, if they are one.
+    pub(super) fn decode(bytes: &[u8]) -> Option<Answer> {
+        serde_json::from_slice(bytes).ok().map(Answer::bounded)
+    }
+}
+
+#[cfg(any(test, fuzzing))]
+impl Answer {
+    /// Asserts that nothing in it is too long or may not be shown.
+    fn assert_bounded(&self) {
+        assert!(self.lines.len() <= LINES_MAX);
+        let checkout = self.host.iter().filter_map(|host| host.checkout.as_ref());
+        for text in self.lines.iter().map(|line| &line.text).chain(checkout) {
+            assert!(!text.contains(pinion_linux::foreign::is_unseen) && text.chars().count() <= LINE_CHARS_MAX);
+        }
+        let commit = self.host.iter().find_map(|host| host.commit.as_ref());
+        assert!(commit.is_none_or(|commit| commit.len() <= 40 && commit.bytes().all(|b| b.is_ascii_hexdigit())));
+        assert!(serde_json::to_vec(self).is_ok_and(|bytes| bytes.len() <= MESSAGE_BYTES_MAX));
+    }
+}
+
+/// For `fuzz/`: any bytes over the socket, in either direction.
+#[cfg(fuzzing)]
+pub fn search(bytes: &[u8]) {
+    if let Some(answer) = Answer::decode(bytes) {
+        answer.assert_bounded();
+        let _ = answer.dialect();
+    }
+    let _ = serde_json::from_slice::<Question>(bytes);
+    let _ = serde_json::from_slice::<Hello>(bytes);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_testkit::names::any_name;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn an_answer_says_what_it_may_and_fits(
+            name in any_name(), repeat in 1..2000usize, pid: u32, is_sure: bool, lines in 0..20usize,
+        ) {
+            let text = name.repeat(repeat);
+            let host = FoundHost { pid, is_sure, is_attach: is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
+            let line = || Line { is_warning: is_sure, text: text.clone() };
+            let lines = (0..lines).map(|_| line()).collect();
+            let told = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };
+            // Anything may come over the socket.
+            let heard = Answer::decode(&serde_json::to_vec(&told).unwrap()).unwrap();
+            prop_assert_eq!(heard.dialect(), DialectName::Union);
+            heard.assert_bounded();
+        }
+
+        #[test]
+        fn bytes_that_are_no_answer_are_none(bytes: Vec<u8>) {
+            prop_assert!(Answer::decode(&bytes).is_none());
+        }
+    }
+
+    #[test]
+    fn a_dialect_is_one_that_is_known() {
+        let answer = |dialect: &str| {
+            Answer::decode(format!(r#"{{"number":1,"dialect":"{dialect}","host":null,"lines":[]}}"#).as_bytes())
+        };
+        assert_eq!(answer("v0.12").unwrap().dialect().to_string(), "v0.12");
+        assert_eq!(answer("v0.10").unwrap().dialect(), DialectName::Union);
+        assert!(Answer::decode(b"{}").is_none() && Answer::decode("[".repeat(10_000).as_bytes()).is_none());
+    }
+}

@@ -1,0 +1,162 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Finds the dialect that the host speaks. It looks for the process that has the pty open, and for its sources.
+//!
+//! That takes capabilities that open every file and every process of the computer. And it reads files that a host has
+//! written. So a process of its own does it, forked before the program has threads. That process keeps only these
+//! capabilities. Its only descriptor is the socket to the program. The kernel lets it read files and nothing more
+//! (`sys/filter.rs`). It gets a terminal's number. It answers with a dialect, the host that it found, and lines for the
+//! log. The program keeps none of those capabilities, and trusts no answer.
+//!
+//! This file is the program's side. `looker.rs` is the process. `message.rs` has the messages between them.
+
+#![forbid(unsafe_code)]
+
+mod looker;
+mod message;
+
+use std::io;
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::thread;
+
+use log::{Level, log, warn};
+use nix::errno::Errno;
+use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, recv, send, setsockopt, socketpair, sockopt};
+use nix::sys::time::{TimeVal, TimeValLike as _};
+
+use crate::host::klippy::process::Terminal;
+use pinion_firmware::mcu::DialectName;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::sys;
+
+use crate::core::responses::LinkWake;
+use crate::process::forked::THREADS_MAX;
+use crate::status::HostBoard;
+use crate::trouble::{NO_PROCESS, refused};
+use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
+
+pub(crate) use looker::NAME;
+#[cfg(fuzzing)]
+pub use message::search;
+
+/// How long the new process may take to be ready, in seconds.
+const START_S: i64 = 5;
+
+/// The search, before its first question.
+pub struct HostSearch(OwnedFd);
+
+impl HostSearch {
+    /// Forks the process. Call it before any thread starts.
+    pub(crate) fn start() -> Result<HostSearch, Trouble> {
+        let started = HostSearch::try_start();
+        started.map_err(|error| refused("the search for the host cannot be started", error).remedy(NO_PROCESS))
+    }
+
+    fn try_start() -> io::Result<HostSearch> {
+        let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(START_S))?;
+        sys::fork(THREADS_MAX, move || {
+            looker::live(&theirs);
+            0
+        })?;
+        let mut message = vec![0; MESSAGE_BYTES_MAX];
+        let hello = match receive(&socket, &mut message) {
+            Ok(hello) => serde_json::from_slice::<Hello>(hello).map_err(io::Error::other)?,
+            Err(Errno::EAGAIN) => return Err(io::Error::other(format!("it is not ready within {START_S} s"))),
+            Err(error) => return Err(error.into()),
+        };
+        if let Some(why) = hello.unconfined {
+            warn!(
+                "the search for the host is not confined, and may do more than it needs: {why}: use a kernel with seccomp filters"
+            );
+        }
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(0))?;
+        Ok(HostSearch(socket))
+    }
+}
+
+/// The next message, if it is not too long.
+fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]> {
+    loop {
+        return match recv(socket.as_raw_fd(), message, MsgFlags::MSG_TRUNC) {
+            Err(Errno::EINTR) => continue,
+            Err(error) => Err(error),
+            Ok(0) => Err(Errno::ECONNRESET),
+            Ok(len) => message.get(..len).ok_or(Errno::EMSGSIZE),
+        };
+    }
+}
+
+/// The link's way to the search. A thread receives the answers.
+pub(crate) struct HostFinder {
+    socket: Arc<OwnedFd>,
+    terminal: Terminal,
+    board: Arc<HostBoard>,
+    answers: Receiver<(u32, DialectName)>,
+    /// The number of the last question.
+    asked: u32,
+}
+
+impl HostFinder {
+    /// Lets the search look for the host on the terminal `device`. Each answer wakes the link, and `board` shows the
+    /// host that was found.
+    pub(crate) fn start(
+        search: HostSearch,
+        device: &Path,
+        wake: Arc<LinkWake>,
+        board: Arc<HostBoard>,
+    ) -> io::Result<HostFinder> {
+        let terminal = Terminal::of(device)?;
+        let socket = Arc::new(search.0);
+        let (tell, answers) = channel();
+        let (ear, shown) = (socket.clone(), board.clone());
+        thread::Builder::new().name("host".into()).spawn(move || {
+            let mut message = vec![0; MESSAGE_BYTES_MAX];
+            // This ends when nobody asks any more.
+            while let Ok(bytes) = receive(&ear, &mut message) {
+                let Some(answer) = Answer::decode(bytes) else { break };
+                for line in &answer.lines {
+                    log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
+                }
+                let dialect = answer.dialect();
+                shown.found(answer.host);
+                let told = tell.send((answer.number, dialect));
+                wake.wake();
+                if told.is_err() {
+                    return;
+                }
+            }
+            warn!("the search for the host has ended, or sent nonsense, so every host gets the union of v0.13, master and Kalico: restart Pinion when no print runs");
+            drop(tell);
+            wake.wake();
+        })?;
+        Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
+    }
+
+    /// Asks for the dialect of the host that came just now, on the terminal `device`.
+    pub(crate) fn ask(&mut self, device: Option<&Path>) {
+        if let Some(Ok(terminal)) = device.map(Terminal::of) {
+            self.terminal = terminal;
+        }
+        self.asked = self.asked.wrapping_add(1);
+        self.board.found(None);
+        let question = Question { number: self.asked, terminal: self.terminal };
+        // If the search hangs, the link waits as long as for an answer. If the search is gone, it gives no answer.
+        let flags = MsgFlags::MSG_NOSIGNAL | MsgFlags::MSG_DONTWAIT;
+        let _ = send(self.socket.as_raw_fd(), &serde_json::to_vec(&question).unwrap_or_default(), flags);
+    }
+
+    /// The answer to the last question, if it has come.
+    pub(crate) fn answer(&self) -> Option<DialectName> {
+        loop {
+            match self.answers.try_recv() {
+                Ok((number, dialect)) if number == self.asked => return Some(dialect),
+                Ok(_) => {}
+                Err(TryRecvError::Empty) => return None,
+                Err(TryRecvError::Disconnected) => return Some(DialectName::Union),
+            }
+        }
+    }
+}

@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The link's end of the core. Blocks and requests go in. Responses and log lines come out. It keeps an account of the
+//! blocks.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::thread::{self, Thread};
+use std::time::Duration;
+
+use log::log;
+use rtrb::{Producer, PushError};
+
+use pinion_linux::clock::monotonic;
+use pinion_sync::calls::Progress;
+
+use crate::core::responses::{Inlet, LinkWake};
+use crate::core::{Payload, Request};
+use crate::link::ledger::Ledger;
+
+/// How long to poll until the core has finished the blocks that it was handed.
+const AWAIT_CORE: Duration = Duration::from_micros(100);
+/// How long to wait for more once there is news for the host: one write covers many blocks.
+const AWAIT_MORE: Duration = Duration::from_micros(20);
+/// How long to wait for a core that has no room for requests.
+pub(crate) const STALL: Duration = Duration::from_millis(1);
+/// Room in the core's ring that blocks leave to requests. A stop request must find room while a slow bus holds the
+/// blocks back.
+const REQUESTS_KEPT: usize = 8;
+
+/// The link's end of the core.
+pub(crate) struct CoreEnd {
+    pub(crate) requests: Producer<Request>,
+    pub(crate) thread: Thread,
+    pub(crate) inlet: Inlet,
+    pub(crate) progress: Arc<Progress>,
+    pub(crate) wake: Arc<LinkWake>,
+    pub(crate) ledger: Ledger,
+    /// There is a processor beside the core's, on which the link may poll for the core.
+    pub(crate) may_poll: bool,
+}
+
+/// Counts of what the core was handed up to an instant.
+#[derive(Clone, Copy)]
+pub(crate) struct Handed {
+    blocks: u32,
+    stops: u32,
+}
+
+impl CoreEnd {
+    /// Passes a request to the core. The core takes requests faster than a person or a signal makes them.
+    pub(crate) fn request(&mut self, request: Request) {
+        if matches!(request, Request::Shutdown(_) | Request::Quit(_)) {
+            self.progress.stop_handed();
+        }
+        let mut request = request;
+        while let Err(PushError::Full(back)) = self.requests.push(request) {
+            request = back;
+            self.thread.unpark();
+            thread::sleep(STALL);
+        }
+        self.thread.unpark();
+    }
+
+    /// Whether there is room for another block.
+    pub(crate) fn has_room(&self) -> bool {
+        self.requests.slots() > REQUESTS_KEPT
+    }
+
+    /// Hands a block to the core, if there is room. `stops`: the block asks for an emergency stop.
+    pub(crate) fn hand(&mut self, payload: Payload, stops: bool) {
+        if stops {
+            self.progress.stop_handed();
+        }
+        let _ = self.requests.push(Request::Run(payload));
+        self.ledger.hand();
+    }
+
+    /// What the core has been handed so far.
+    pub(crate) fn handed(&self) -> Handed {
+        Handed { blocks: self.ledger.handed(), stops: self.progress.stops_handed() }
+    }
+
+    /// Whether blocks were handed to the core since `before`.
+    pub(crate) fn has_more_since(&self, before: Handed) -> bool {
+        self.ledger.handed() != before.blocks
+    }
+
+    /// Wakes the core for the blocks that it was handed since `before`, if it can run one of them. A core that is woken
+    /// without need keeps the link waiting.
+    pub(crate) fn wake_for(&self, before: Handed) {
+        let stops = self.progress.stops_handed() != before.stops;
+        if self.has_more_since(before) && (stops || !self.progress.is_held()) {
+            self.thread.unpark();
+        }
+    }
+
+    /// Polls until the core has finished the blocks that it was handed since `before`. To sleep and be woken takes
+    /// longer. If a bus holds the core, it does not poll: these blocks take longer still.
+    pub(crate) fn await_done(&self, before: Handed) {
+        if !self.may_poll || !self.has_more_since(before) {
+            return;
+        }
+        let handed = self.ledger.handed();
+        let (start, mut done) = (monotonic(), self.progress.done());
+        if self.progress.is_held() {
+            return;
+        }
+        let (mut tells, mut until) = (false, start + AWAIT_CORE);
+        while done != handed {
+            let (now, done_now) = (monotonic(), self.progress.done());
+            let progresses = done_now != done || !tells && self.inlet.has_response();
+            done = done_now;
+            if progresses {
+                tells = true;
+                until = (start + AWAIT_CORE).min(now + AWAIT_MORE);
+            }
+            if now >= until {
+                return;
+            }
+            thread::yield_now();
+        }
+    }
+
+    /// Whether there is news for the host: responses or acknowledgements.
+    pub(crate) fn has_news(&self) -> bool {
+        self.inlet.has_response() || self.ledger.is_behind(self.progress.done())
+    }
+
+    /// Logs the core's lines.
+    pub(crate) fn log_lines(&mut self) {
+        while let Some((level, line, kind)) = self.inlet.line() {
+            log!(target: line.get(..kind).unwrap_or_default(), level, "{line}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::core::responses::outlet;
+    use pinion_firmware::mcu::Outbox as _;
+    use rtrb::RingBuffer;
+
+    #[test]
+    fn a_response_is_news_and_so_is_a_finished_block() {
+        let (wake, progress) = (Arc::new(LinkWake::new().unwrap()), Arc::new(Progress::default()));
+        let (mut outlet, inlet) = outlet(wake.clone(), progress.clone());
+        let (requests, _inbox) = RingBuffer::new(16);
+        let (thread, ledger) = (thread::current(), Ledger::default());
+        let mut end = CoreEnd { requests, thread, inlet, progress: progress.clone(), wake, ledger, may_poll: false };
+        assert!(!end.has_news());
+        end.hand(Payload::new(b""), false);
+        progress.begin();
+        assert!(!end.has_news(), "the block is under way");
+        progress.finish();
+        assert!(end.has_news(), "the host waits for its acknowledgement");
+        let done = progress.done();
+        end.ledger.acknowledge(done);
+        assert!(!end.has_news());
+        outlet.send(b"response");
+        assert!(end.has_news());
+    }
+}

@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program's other processes: the guardian, and the search for the host. Both are forked before the program has
+//! threads, because a process with threads cannot be forked.
+
+#![forbid(unsafe_code)]
+
+use std::ffi::CStr;
+
+use log::warn;
+
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::sys;
+
+use crate::guardian::{self, Guardian};
+use crate::host::search::{self, HostSearch};
+use crate::recorder::Recording;
+
+/// The kernel's names of these processes. Their command lines are the program's.
+pub const NAMES: [&CStr; 2] = [guardian::NAME, search::NAME];
+
+/// The program's helper processes.
+#[derive(Default)]
+pub struct Helpers {
+    /// It guards the board's outputs.
+    pub guardian: Option<Guardian>,
+    /// Without it every host is served in the dialect that most hosts accept.
+    pub search: Option<HostSearch>,
+}
+
+impl Helpers {
+    /// Forks them, then gives up the rights that this process does not need. Call it before any thread starts.
+    /// `guarded` asks for a guardian. `rights` are the capabilities that this process keeps, if it has them.
+    ///
+    /// # Errors
+    ///
+    /// There are threads already, or the kernel has no room for a process, a socket or a page.
+    pub fn start(recording: &Recording, guarded: bool, searches: bool, rights: u32) -> Result<Helpers, Trouble> {
+        // The search comes first, because it must share nothing with the guardian.
+        let search = searches.then(HostSearch::start).transpose()?;
+        let guardian = guarded.then(|| Guardian::start(recording)).transpose()?;
+        if let Err(error) = sys::keep_only(rights) {
+            warn!(
+                "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion keeps more rights than it needs"
+            );
+        }
+        Ok(Helpers { guardian, search })
+    }
+}

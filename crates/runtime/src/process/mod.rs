@@ -1,0 +1,11 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What Pinion is to the kernel and to the service manager: real time, signals, the processes that it forks, watchdogs.
+
+#![forbid(unsafe_code)]
+
+pub(crate) mod forked;
+pub mod helpers;
+pub(crate) mod notify;
+pub mod realtime;
+pub(crate) mod signals;
+pub(crate) mod watchdog;

@@ -1,0 +1,209 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Whether a running program serves the terminal that a link leads to. A second program at the same link would take
+//! the host from the first one.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+use std::fs::{self, Metadata};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use crate::host::klippy::process::{self, Process, is_pseudo_terminal, server};
+use pinion_linux::foreign;
+
+/// Highest number of links that the kernel follows (path_resolution(7)).
+const LINKS_MAX: usize = 40;
+/// Longest part of /proc/PID/cgroup that is looked at.
+const GROUPS_BYTES_MAX: u64 = 4096;
+/// How much younger than its link a served terminal may be. Klipper's own program changes the mode after it makes the
+/// link.
+const YOUNGER_MAX_S: i64 = 1;
+/// The programs that serve hosts, each with its name for people.
+const PROGRAMS: [(&str, &str); 3] =
+    [("pinion", "Pinion"), ("pinion-sim", "Pinion"), ("klipper_mcu", "Klipper's own klipper_mcu")];
+
+/// A terminal that a running program serves.
+#[derive(Debug)]
+pub struct Served {
+    link: PathBuf,
+    device: PathBuf,
+    /// The program's name for people. `None` if it is none that serves hosts.
+    program: Option<&'static str>,
+    pid: Option<u32>,
+    unit: Option<String>,
+}
+
+/// The terminal behind a link, if a running program serves it.
+///
+/// The kernel removes a terminal when its program ends. The next terminal, such as a login's, gets the same number. So
+/// a terminal that is younger than the link to it is not ours. (`systemd/link` has the same rule.)
+pub fn served(link: &Path) -> Option<Served> {
+    let way = follow(link);
+    let [.., last_link, device] = &way[..] else { return None };
+    let terminal = fs::metadata(device).ok()?;
+    if !is_pseudo_terminal(&terminal) {
+        return None;
+    }
+    let proc = Path::new("/proc");
+    let server = server(proc, device).ok().flatten();
+    if server.as_ref().is_some_and(|server| has_another_link(proc, server, &way)) {
+        return None;
+    }
+    if server.as_ref().and_then(known).is_none() && is_younger(&terminal, &fs::symlink_metadata(last_link).ok()?) {
+        return None;
+    }
+    let server = server.or_else(|| hidden_server(proc, &way, &terminal));
+    let groups = server.as_ref().and_then(|server| {
+        let groups = foreign::read(&proc.join(server.pid.to_string()).join("cgroup"), GROUPS_BYTES_MAX).ok()?;
+        String::from_utf8(groups).ok()
+    });
+    let unit = groups.as_deref().and_then(process::unit);
+    Some(Served {
+        link: link.to_owned(),
+        device: device.clone(),
+        program: server.as_ref().and_then(known),
+        pid: server.map(|process| process.pid),
+        // A program that cron started, for example, belongs to cron's unit.
+        unit: unit.filter(|unit| unit.contains("pinion") || unit.contains("klipper")).map(str::to_owned),
+    })
+}
+
+/// The path, and the paths that its links lead through, in order. (The kernel itself does not follow another user's
+/// link in /tmp.)
+fn follow(link: &Path) -> Vec<PathBuf> {
+    let mut way = vec![link.to_owned()];
+    while way.len() <= LINKS_MAX
+        && let Some(last) = way.last()
+        && let Ok(target) = fs::read_link(last)
+    {
+        let next = last.parent().unwrap_or(Path::new("")).join(target);
+        way.push(next);
+    }
+    way
+}
+
+/// Whether the program was told to serve the terminal at another link. Then an earlier program, whose terminal had the
+/// same number, left this link behind.
+fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
+    let Some(link) = server.arguments.iter().skip_while(|argument| *argument != Path::new("-I")).nth(1) else {
+        return false;
+    };
+    let Ok(folder) = fs::read_link(proc.join(server.pid.to_string()).join("cwd")) else { return false };
+    let link = folder.join(link);
+    // Do not compare names: a link has more than one.
+    let identity = |path: &Path| fs::symlink_metadata(path).ok().map(|about| (about.dev(), about.ino()));
+    // The program may have its terminal, but not its link yet.
+    let theirs = identity(&link);
+    theirs.is_none() || way.iter().all(|path| identity(path) != theirs)
+}
+
+/// Whether the terminal was made after the link. A later change, such as a new mode, makes it younger too.
+fn is_younger(terminal: &Metadata, link: &Metadata) -> bool {
+    (terminal.ctime() - YOUNGER_MAX_S, terminal.ctime_nsec()) > (link.mtime(), link.mtime_nsec())
+}
+
+/// The name for people of a program that serves hosts.
+fn known(process: &Process) -> Option<&'static str> {
+    PROGRAMS
+        .iter()
+        .find(|(name, _)| process.program().is_some_and(|program| program == *name))
+        .map(|(_, called)| *called)
+}
+
+/// The program of another user that likely serves the terminal. It is one of the terminal's owner. A program whose
+/// command line names a link on the way to the terminal comes first. The oldest comes next, because a guardian was
+/// started after its program.
+fn hidden_server(proc: &Path, way: &[PathBuf], terminal: &Metadata) -> Option<Process> {
+    let is_owner = |process: &Process| {
+        fs::metadata(proc.join(process.pid.to_string())).is_ok_and(|about| about.uid() == terminal.uid())
+    };
+    let names_link = |process: &Process| process.arguments.iter().any(|argument| way.contains(argument));
+    let processes = process::all(proc).ok()?.into_iter();
+    processes
+        .filter(|process| known(process).is_some() && is_owner(process) && process.is_hidden(proc))
+        .min_by_key(|process| (!names_link(process), process.started, process.pid))
+}
+
+impl fmt::Display for Served {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Served { link, device, program, pid, unit } = self;
+        let served_by = program.unwrap_or("another program");
+        write!(f, "{} leads to {}, which {served_by} serves", link.display(), device.display())?;
+        pid.map_or(Ok(()), |pid| write!(f, " (process {pid})"))?;
+        match (program, unit, pid) {
+            // Any user can make a link in /tmp to any terminal, such as the one of root's login.
+            (None, _, Some(_)) => write!(f, ": remove the link, unless that program has made it"),
+            (_, Some(unit), Some(_)) => write!(f, ": stop it (sudo systemctl stop {})", foreign::word(unit)),
+            (_, None, Some(pid)) => write!(f, ": stop it (sudo kill {pid})"),
+            (.., None) => write!(f, ": stop it (sudo pinion doctor may name it)"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nix::fcntl::AT_FDCWD;
+    use nix::pty::openpty;
+    use nix::sys::stat::{UtimensatFlags, utimensat};
+    use nix::sys::time::{TimeSpec, TimeValLike as _};
+    use nix::unistd::ttyname;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    #[test]
+    fn a_terminal_is_served_unless_it_is_younger_than_its_link() {
+        let folder = tempfile::tempdir().unwrap();
+        let (own, link) = (folder.path().join("own"), folder.path().join("link"));
+        assert!(served(&link).is_none(), "there is nothing");
+        symlink("own", &link).unwrap();
+        symlink("/dev/pts/no-longer-there", &own).unwrap();
+        assert!(served(&link).is_none(), "its program has ended");
+        fs::remove_file(&own).unwrap();
+        symlink("/dev/null", &own).unwrap();
+        assert!(served(&link).is_none(), "that is no terminal");
+        fs::remove_file(&own).unwrap();
+        let pty = openpty(None, None).unwrap();
+        let device = ttyname(&pty.slave).unwrap();
+        symlink(&device, &own).unwrap();
+        // Klipper's own program does this.
+        fs::set_permissions(&device, fs::Permissions::from_mode(0o660)).unwrap();
+        let found = served(&link).unwrap().to_string();
+        let expected = format!("{} leads to {}, which another program serves", link.display(), device.display());
+        assert!(found.starts_with(&expected), "{found}");
+        // The link of an ended program, and a new terminal with the same number.
+        let hour_ago = TimeSpec::seconds(fs::symlink_metadata(&own).unwrap().mtime() - 3600);
+        utimensat(AT_FDCWD, &own, &hour_ago, &hour_ago, UtimensatFlags::NoFollowSymlink).unwrap();
+        assert!(served(&link).is_none(), "it is another's terminal");
+    }
+
+    #[test]
+    fn a_round_of_links_leads_nowhere() {
+        let folder = tempfile::tempdir().unwrap();
+        symlink("b", folder.path().join("a")).unwrap();
+        symlink("a", folder.path().join("b")).unwrap();
+        assert!(served(&folder.path().join("a")).is_none());
+    }
+
+    #[test]
+    fn what_stops_a_program_is_told() {
+        let by = |program, unit: Option<&str>, pid| {
+            let (link, device) = ("/tmp/klipper_host_mcu".into(), "/dev/pts/3".into());
+            Served { link, device, program, pid, unit: unit.map(str::to_owned) }.to_string()
+        };
+        let told = |unit, pid| by(Some("Pinion"), unit, pid);
+        let begins = "/tmp/klipper_host_mcu leads to /dev/pts/3, which Pinion serves";
+        let by_unit = format!("{begins} (process 7): stop it (sudo systemctl stop pinion-mcu)");
+        assert_eq!(told(Some("pinion-mcu"), Some(7)), by_unit);
+        assert_eq!(told(None, Some(7)), format!("{begins} (process 7): stop it (sudo kill 7)"));
+        assert_eq!(told(None, None), format!("{begins}: stop it (sudo pinion doctor may name it)"));
+        // The link is another user's, and the terminal is of root's login.
+        for unit in [Some("ssh"), None] {
+            let told = by(None, unit, Some(7));
+            assert!(
+                !told.contains("sudo") && told.ends_with("remove the link, unless that program has made it"),
+                "{told}"
+            );
+        }
+    }
+}
