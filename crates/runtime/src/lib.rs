@@ -67,12 +67,12 @@ pub use transport::stdio::give_back;
 pub use transport::terminal_group::{CLOSED, TerminalGroup};
 pub use trouble::started;
 
-use self::core::heartbeat::Pulse;
+use self::core::heartbeat::Heartbeat;
 use self::core::responses::LinkWake;
 use self::core::start::{CoreThread, REQUESTS};
 use self::core::wakeup::MarginLimits;
 use self::core::{Left, Request};
-use link::handshake::Introduction;
+use link::handshake::Handshake;
 use link::host_end::HostEnd;
 use link::oversight::Oversight;
 use link::thread::{End, LinkThread};
@@ -81,7 +81,7 @@ use process::realtime::{Processors, Role};
 use process::signals::Signals;
 use process::watchdog::{Vigil, Watchdog};
 use recorder::Recorder;
-use status::{Facts, HostBoard, StatusSocket};
+use status::{Facts, HostStatus, StatusSocket};
 use trouble::{no_room, refused};
 
 /// Version of the build.
@@ -133,9 +133,9 @@ pub fn run(
 ) -> Result<(), Trouble> {
     sys::return_large_blocks();
     let Helpers { guardian, search } = helpers;
-    let pulse = guardian
+    let heartbeat = guardian
         .as_ref()
-        .map_or_else(|| Pulse::new(recording.clock()), |guardian| Ok(guardian.pulse()))
+        .map_or_else(|| Heartbeat::new(recording.clock()), |guardian| Ok(guardian.heartbeat()))
         .map_err(no_room)?;
     let processors = Processors::new(options.cpu)?;
     // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
@@ -143,7 +143,7 @@ pub fn run(
     let link = options.link.open(&options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
-    let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
+    let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostStatus::default()));
     shown.serve_on(link.detail());
     let dialect = options.dialect.or_else(|| (!options.link.is_local()).then_some(DialectName::Union));
     if options.dialect.is_none() && !options.link.is_local() {
@@ -152,8 +152,8 @@ pub fn run(
         );
     }
     let place = (link.wire(), link.terminal());
-    let introduction = Introduction::start(dialect, &*board, search, place, &wake, &shown)?;
-    let (teller, asker) = status::ends();
+    let handshake = Handshake::start(dialect, &*board, search, place, &wake, &shown)?;
+    let (snapshots, snapshot_reader) = status::ends();
     let facts = Facts {
         link: link.place(),
         board: board.describe(),
@@ -163,8 +163,8 @@ pub fn run(
         requests: REQUESTS,
         recorder: recording.status(),
     };
-    let _status = StatusSocket::start(&options.sockets, link.terminal(), facts, shown.clone(), asker);
-    let (mut recorder, tape) = Recorder::new(recording.clone()).map_err(no_room)?;
+    let _status = StatusSocket::start(&options.sockets, link.terminal(), facts, shown.clone(), snapshot_reader);
+    let (mut recorder, trace_writer) = Recorder::new(recording.clone()).map_err(no_room)?;
     let board = if options.trace_edges { recorder.with_edges(board) } else { board };
     let trace_sockets = trace_socket_paths(&options.sockets);
     let trace_socket = status::open_socket(&trace_sockets, link.terminal(), |errors| {
@@ -176,16 +176,27 @@ pub fn run(
     if realtime {
         realtime::lock_memory();
     }
-    let (clock, dialect) = (timing.clock.clone(), introduction.first_dialect());
-    let core =
-        CoreThread { board, timing, dialect, wake, pulse, teller, recording, tape, processors, margin, realtime };
+    let (clock, dialect) = (timing.clock.clone(), handshake.first_dialect());
+    let core = CoreThread {
+        board,
+        timing,
+        dialect,
+        wake,
+        heartbeat,
+        snapshots,
+        recording,
+        trace_writer,
+        processors,
+        margin,
+        realtime,
+    };
     let (core, core_end) = core.start()?;
     started(recorder.start(trace_socket))?;
 
     info!("{} {} ({})", transport::serving(link.event().is_some()), link.place(), link.detail());
-    let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
+    let vigil = Vigil::new(notify, notify::watchdog_interval(), heartbeat);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
-    let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);
+    let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, handshake, oversight, clock, recorder);
     if realtime {
         realtime::enter(Role::Link);
     }

@@ -4,19 +4,21 @@
 //! (docs/develop/sanitizers.md).
 //!
 //! - [`ring`]: the newest records of one writer
-//! - [`together`]: the newest words of one writer, which belong together
-//! - [`life`]: signs of life, debts, and what workers are at
-//! - [`calls`]: wake-ups between the core and the link, and what each has done
+//! - [`seqlock`]: the newest words of one writer, which belong together (a latched counter)
+//! - [`heartbeat`]: heartbeats, pending shutdown values, and since when a worker has run its job
+//! - [`sleep_flag`]: wake-ups between the core and the link
+//! - [`progress`]: how far the core has come with the host's blocks
 //! - [`watch`]: a line whose pulses one thread makes, and another one ends if the first is late
 //!
 //! A structure in memory that processes share is given its words, and is a view of them. They are zero at first.
 
 #![forbid(unsafe_code)]
 
-pub mod calls;
-pub mod life;
+pub mod heartbeat;
+pub mod progress;
 pub mod ring;
-pub mod together;
+pub mod seqlock;
+pub mod sleep_flag;
 pub mod watch;
 
 /// The atomics of loom in its models, and those of the standard library everywhere else.

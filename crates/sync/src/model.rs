@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed as Std};
 
 use crate::atomic::{AtomicU32, AtomicU64, Ordering};
-use crate::calls::{Doze, Progress};
-use crate::life::{Heart, Slot};
+use crate::heartbeat::{JobSlot, SharedHeartbeat};
+use crate::progress::Progress;
 use crate::ring::{self, Found, Ring};
-use crate::together::Together;
+use crate::seqlock::Seqlock;
 use crate::watch::Watch;
 
 /// Runs a model, and prints in how many orders. `one` and `other` share what `start` makes, and `check` sees what both
@@ -131,7 +131,7 @@ fn a_first_name_is_whole() {
 fn words_are_together() {
     model(
         "together",
-        || Together::of(&[0; 2]),
+        || Seqlock::of(&[0; 2]),
         |words| (1..=2).for_each(|word| words.store([word; 2])),
         |words| words.load(|words| words.collect::<Vec<_>>()),
         |_, (), words| assert_eq!(words[0], words[1], "torn"),
@@ -143,7 +143,7 @@ fn words_are_together() {
 fn words_are_as_new_as_the_message_about_them() {
     model(
         "together: a message",
-        || (Together::of(&[0; 2]), words::<1>()),
+        || (Seqlock::of(&[0; 2]), words::<1>()),
         |(words, told)| {
             words.store([1; 2]);
             told[0].store(1, Ordering::Release);
@@ -160,14 +160,14 @@ const RUNNING: u32 = 550;
 fn a_beat_is_as_new_as_its_limit() {
     let start = || {
         let words = words::<4>();
-        Heart::new(&words).beat(1, IDLE);
+        SharedHeartbeat::new(&words).beat(1, IDLE);
         words
     };
     model(
         "heart: beats",
         start,
-        |words| (2..=3).for_each(|at| Heart::new(words).beat(at, RUNNING)),
-        |words| Heart::new(words).listen(),
+        |words| (2..=3).for_each(|at| SharedHeartbeat::new(words).beat(at, RUNNING)),
+        |words| SharedHeartbeat::new(words).listen(),
         |_, (), heard| assert!(heard.silence_max_ms == Some(IDLE) || heard.beat_at >= 2, "{heard:?}"),
     );
 }
@@ -176,18 +176,18 @@ fn a_beat_is_as_new_as_its_limit() {
 fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
     let start = || {
         let words = words::<5>();
-        Heart::new(&words).beat(1, RUNNING);
+        SharedHeartbeat::new(&words).beat(1, RUNNING);
         words
     };
     model(
         "heart: a debt begins",
         start,
         |words| {
-            Heart::new(words).owe("pwmchip0", 5);
+            SharedHeartbeat::new(words).set_pending("pwmchip0", 5);
             // The core goes on, and this does not count.
-            Heart::new(words).beat(6, RUNNING);
+            SharedHeartbeat::new(words).beat(6, RUNNING);
         },
-        |words| (Heart::new(words).listen(), Heart::new(words).subject().get()),
+        |words| (SharedHeartbeat::new(words).listen(), SharedHeartbeat::new(words).subject().get()),
         |_, (), (heard, subject)| {
             assert!(
                 heard.silence_max_ms.is_some() || (heard.beat_at == 5 && subject == "pwmchip0"),
@@ -199,11 +199,11 @@ fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
         "heart: a debt ends",
         move || {
             let words = start();
-            Heart::new(&words).owe("pwmchip0", 5);
+            SharedHeartbeat::new(&words).set_pending("pwmchip0", 5);
             words
         },
-        |words| Heart::new(words).paid(9),
-        |words| Heart::new(words).listen(),
+        |words| SharedHeartbeat::new(words).clear_pending(9),
+        |words| SharedHeartbeat::new(words).listen(),
         |_, (), heard| assert!(heard.silence_max_ms.is_none() || heard.beat_at == 9, "{heard:?}"),
     );
 }
@@ -212,14 +212,14 @@ fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
 fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
     let start = || {
         let words = words::<3>();
-        Slot::new(&words).name().set("old");
-        Slot::new(&words).begin(1);
+        JobSlot::new(&words).name().set("old");
+        JobSlot::new(&words).begin(1);
         words
     };
     // A third thread, the old worker, frees the slot.
     let replace = |words: &[AtomicU32; 3]| {
-        if !Slot::new(words).name().is_set() {
-            Slot::new(words).name().set("new one");
+        if !JobSlot::new(words).name().is_set() {
+            JobSlot::new(words).name().set("new one");
         }
     };
     let check = |name: String, busy: Option<u32>| {
@@ -228,18 +228,18 @@ fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
     model(
         "slot: a worker ends, another begins",
         start,
-        |words| Slot::new(words).free(),
+        |words| JobSlot::new(words).free(),
         replace,
-        move |words, (), ()| check(Slot::new(words).name().get(), Slot::new(words).busy_since()),
+        move |words, (), ()| check(JobSlot::new(words).name().get(), JobSlot::new(words).busy_since()),
     );
     model(
         "slot: a look at it",
         start,
         move |words| {
-            Slot::new(words).free();
+            JobSlot::new(words).free();
             replace(words);
         },
-        |words| (Slot::new(words).name().get(), Slot::new(words).busy_since()),
+        |words| (JobSlot::new(words).name().get(), JobSlot::new(words).busy_since()),
         move |_, (), (name, busy)| check(name, busy),
     );
 }
@@ -247,29 +247,29 @@ fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
 /// The link sleeps and wakes up, while the core puts something where it looks.
 #[test]
 fn no_wake_up_is_lost() {
-    let put = |(doze, put, event): &(Doze, [AtomicU32; 1], [AtomicU32; 1])| {
+    let put = |(sleep_flag, put, event): &(SleepFlag, [AtomicU32; 1], [AtomicU32; 1])| {
         for number in 1..=2 {
             put[0].store(number, Ordering::Release);
-            if doze.is_to_be_woken() {
+            if sleep_flag.is_to_be_woken() {
                 event[0].fetch_add(1, Ordering::AcqRel);
             }
         }
     };
     model(
-        "doze",
-        || (Doze::default(), words::<1>(), words::<1>()),
+        "sleep_flag",
+        || (SleepFlag::default(), words::<1>(), words::<1>()),
         put,
-        |(doze, put, event)| {
+        |(sleep_flag, put, event)| {
             // It goes to sleep, as it has nothing to do. It wakes up for a call, or because it wants to.
-            doze.begin();
+            sleep_flag.begin();
             put[0].load(Ordering::Acquire);
             let is_called = event[0].load(Ordering::Acquire) != 0;
-            doze.end();
+            sleep_flag.end();
             if is_called {
                 event[0].swap(0, Ordering::AcqRel);
             }
             // This time it wakes up only for a call.
-            doze.begin();
+            sleep_flag.begin();
             put[0].load(Ordering::Acquire) == 2
         },
         |(_, _, event), (), has_seen_all| {

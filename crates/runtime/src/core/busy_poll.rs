@@ -18,7 +18,7 @@ const EARNS: i64 = 3;
 
 /// Decides for one thread whether it polls.
 #[derive(Debug)]
-pub(crate) struct Lookout {
+pub(crate) struct PollBudget {
     may_poll: bool,
     until: Clock,
     looked: Clock,
@@ -26,10 +26,10 @@ pub(crate) struct Lookout {
     ration: i64,
 }
 
-impl Lookout {
+impl PollBudget {
     /// Nothing is expected yet. Without `may_poll` the thread never polls.
-    pub(crate) fn new(may_poll: bool, now: Clock) -> Lookout {
-        Lookout { may_poll, until: now, looked: now, ration: RATION }
+    pub(crate) fn new(may_poll: bool, now: Clock) -> PollBudget {
+        PollBudget { may_poll, until: now, looked: now, ration: RATION }
     }
 
     /// The next step of the conversation is expected within `span`.
@@ -71,23 +71,23 @@ mod tests {
 
     #[test]
     fn it_polls_for_its_span_and_not_when_idle() {
-        let mut lookout = Lookout::new(true, at(0));
-        assert!(!lookout.goes_on(at(0)) && !lookout.goes_on(at(1_000)), "nothing is expected");
-        lookout.expect(at(2_000), SPAN);
-        assert!(lookout.goes_on(at(2_000)) && lookout.goes_on(at(2_049)));
-        assert!(!lookout.goes_on(at(2_050)) && !lookout.goes_on(at(9_000)));
-        lookout.expect(at(9_000), SPAN);
-        assert!(lookout.goes_on(at(9_020)));
+        let mut polling = PollBudget::new(true, at(0));
+        assert!(!polling.goes_on(at(0)) && !polling.goes_on(at(1_000)), "nothing is expected");
+        polling.expect(at(2_000), SPAN);
+        assert!(polling.goes_on(at(2_000)) && polling.goes_on(at(2_049)));
+        assert!(!polling.goes_on(at(2_050)) && !polling.goes_on(at(9_000)));
+        polling.expect(at(9_000), SPAN);
+        assert!(polling.goes_on(at(9_020)));
         // An event during the polling begins another span.
-        lookout.expect(at(9_040), SPAN);
-        assert!(lookout.goes_on(at(9_089)) && !lookout.goes_on(at(9_090)));
+        polling.expect(at(9_040), SPAN);
+        assert!(polling.goes_on(at(9_089)) && !polling.goes_on(at(9_090)));
     }
 
     #[test]
     fn a_single_processor_is_left_to_the_thread_that_is_waited_for() {
-        let mut lookout = Lookout::new(false, at(0));
-        lookout.expect(at(0), SPAN);
-        assert!(!lookout.goes_on(at(0)) && !lookout.goes_on(at(1)));
+        let mut polling = PollBudget::new(false, at(0));
+        polling.expect(at(0), SPAN);
+        assert!(!polling.goes_on(at(0)) && !polling.goes_on(at(1)));
     }
 
     proptest! {
@@ -95,16 +95,16 @@ mod tests {
         /// In any second, any conversation polls for at most a quarter of the time and one ration.
         #[test]
         fn polling_is_rationed(turns in proptest::collection::vec((0u64..20_000, 1u64..20_000), 1..20)) {
-            let mut lookout = Lookout::new(true, Clock::from_ticks(0));
+            let mut polling = PollBudget::new(true, Clock::from_ticks(0));
             let (mut now, mut polled) = (0, Vec::new());
             for (works, waits) in turns.iter().cycle() {
                 if now > 4 * SECOND {
                     break;
                 }
                 now += works + 1;
-                lookout.expect(Clock::from_ticks(now), SPAN);
+                polling.expect(Clock::from_ticks(now), SPAN);
                 let answered = now + waits;
-                while now < answered && lookout.goes_on(Clock::from_ticks(now)) {
+                while now < answered && polling.goes_on(Clock::from_ticks(now)) {
                     polled.push(now);
                     now += 25;
                 }

@@ -8,10 +8,10 @@
 //! Opening a device or ending a worker may then take its time.
 //!
 //! At a shutdown, workers write some of the outputs. Until they have done so, the MCU owes these shutdown values
-//! ([`Pulse::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
+//! ([`Heartbeat::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
 //! core that hangs.
 //!
-//! The guardian in turn leaves a sign each time it listens. With [`GuardianEar`] the program notices a guardian that is
+//! The guardian in turn leaves a sign each time it listens. With [`GuardianMonitor`] the program notices a guardian that is
 //! stopped or hangs.
 
 #![forbid(unsafe_code)]
@@ -27,7 +27,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys::{self, SHARED_WORDS};
-use pinion_sync::life::{Heard, Heart, Slot};
+use pinion_sync::heartbeat::{JobSlot, LastBeat, SharedHeartbeat};
 
 /// How long the core may be silent while the MCU runs.
 pub(crate) const RUNNING: Duration = Duration::from_millis(550);
@@ -63,17 +63,17 @@ const SLOT_WORDS: usize = 8;
 
 /// The core's heartbeat, and the page itself.
 #[derive(Clone, Copy)]
-pub(crate) struct Pulse {
+pub(crate) struct Heartbeat {
     page: &'static [AtomicU32; SHARED_WORDS],
     clock: Monotonic,
 }
 
-impl Pulse {
+impl Heartbeat {
     /// Gives a first beat now. `clock` is the core's.
-    pub(crate) fn new(clock: Monotonic) -> io::Result<Pulse> {
-        let pulse = Pulse { page: sys::shared_words()?, clock };
-        pulse.beat(clock.now(), false);
-        Ok(pulse)
+    pub(crate) fn new(clock: Monotonic) -> io::Result<Heartbeat> {
+        let heartbeat = Heartbeat { page: sys::shared_words()?, clock };
+        heartbeat.beat(clock.now(), false);
+        Ok(heartbeat)
     }
 
     /// The core is alive at `now`. `running`: its MCU is configured and not shut down. Only the core calls this.
@@ -83,8 +83,8 @@ impl Pulse {
         self.heart().beat(stamp(now), silence_max.as_millis() as u32);
     }
 
-    fn heart(&self) -> Heart<'static> {
-        Heart::new(&self.page[HEART..WORKERS])
+    fn heart(&self) -> SharedHeartbeat<'static> {
+        SharedHeartbeat::new(&self.page[HEART..WORKERS])
     }
 
     /// Why a running MCU has to be stopped, if it stood still since the last beat. Its control group was frozen, or the
@@ -122,13 +122,13 @@ impl Pulse {
     /// From now on the MCU owes the shutdown value of `subject`, such as `pwmchip0/pwm1`. The first call is a sign of
     /// life at `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
     /// replaces the subject, not the time. Only the core calls this.
-    pub(crate) fn owe(&self, subject: &str, now: Clock) {
-        self.heart().owe(subject, stamp(now));
+    pub(crate) fn set_pending(&self, subject: &str, now: Clock) {
+        self.heart().set_pending(subject, stamp(now));
     }
 
     /// Every output is at its shutdown value. This is a sign of life at `now`. Only the core calls this.
-    pub(crate) fn paid(&self, now: Clock) {
-        self.heart().paid(stamp(now));
+    pub(crate) fn clear_pending(&self, now: Clock) {
+        self.heart().clear_pending(stamp(now));
     }
 
     /// The guardian did not answer the program, and counts as lost.
@@ -149,7 +149,7 @@ impl Pulse {
 
     /// How long the core may be silent, and the time of its last beat.
     fn listen(&self) -> (Duration, u32) {
-        let Heard { silence_max_ms, beat_at } = self.heart().listen();
+        let LastBeat { silence_max_ms, beat_at } = self.heart().listen();
         (silence_max_ms.map_or(STOPPING, |ms| Duration::from_millis(ms.into())), beat_at)
     }
 
@@ -175,17 +175,17 @@ impl Pulse {
     pub(crate) fn worker(&self, bus: &str) -> Option<JobClock> {
         let slot = self.slots().find(|slot| !slot.name().is_set())?;
         slot.name().set(bus);
-        Some(JobClock { slot, pulse: *self })
+        Some(JobClock { slot, heartbeat: *self })
     }
 
     /// The bus of a worker whose present job takes longer than `limit` at `now`.
     pub(crate) fn stuck(&self, now: Clock, limit: Duration) -> Option<String> {
-        let is_stuck = |slot: &Slot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
+        let is_stuck = |slot: &JobSlot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
         self.slots().find(is_stuck).map(|slot| slot.name().get())
     }
 
-    fn slots(&self) -> impl Iterator<Item = Slot<'static>> {
-        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(Slot::new)
+    fn slots(&self) -> impl Iterator<Item = JobSlot<'static>> {
+        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(JobSlot::new)
     }
 }
 
@@ -201,14 +201,14 @@ fn elapsed(since: u32, now: Clock) -> Duration {
 
 /// Shows others since when a worker is at its present job.
 pub(crate) struct JobClock {
-    slot: Slot<'static>,
-    pulse: Pulse,
+    slot: JobSlot<'static>,
+    heartbeat: Heartbeat,
 }
 
 impl JobClock {
     /// A job begins.
     pub(crate) fn begin(&self) {
-        self.slot.begin(stamp(self.pulse.now()));
+        self.slot.begin(stamp(self.heartbeat.now()));
     }
 
     /// The job ends.
@@ -256,36 +256,36 @@ impl Silence {
     }
 }
 
-/// The guardian's ear. It listens to the heartbeat, and leaves a sign of its own each time. It lives as long as the
+/// The guardian's monitor. It listens to the heartbeat, and leaves a sign of its own each time. It lives as long as the
 /// guardian holds outputs.
-pub(crate) struct Ear {
-    pulse: Pulse,
+pub(crate) struct HeartbeatMonitor {
+    heartbeat: Heartbeat,
     silence: Silence,
     suspensions: Suspensions,
 }
 
-impl Ear {
+impl HeartbeatMonitor {
     /// Listens from `now` on.
-    pub(crate) fn new(pulse: Pulse, now: Clock) -> Ear {
-        let (_, beat_at) = pulse.listen();
-        Ear { pulse, silence: Silence::new(beat_at, now), suspensions: Suspensions::new() }
+    pub(crate) fn new(heartbeat: Heartbeat, now: Clock) -> HeartbeatMonitor {
+        let (_, beat_at) = heartbeat.listen();
+        HeartbeatMonitor { heartbeat, silence: Silence::new(beat_at, now), suspensions: Suspensions::new() }
     }
 
     /// How long not to look again. `None` if the heartbeat is missing at `now`.
     pub(crate) fn listen(&mut self, now: Clock) -> Option<Duration> {
-        self.pulse.page[LISTENED_AT].store(stamp(now).max(1), Ordering::Relaxed);
+        self.heartbeat.page[LISTENED_AT].store(stamp(now).max(1), Ordering::Relaxed);
         if let Some(suspended) = self.suspensions.newest() {
-            self.pulse.tell_suspension(suspended);
+            self.heartbeat.tell_suspension(suspended);
         }
-        let (silence_max, beat_at) = self.pulse.listen();
+        let (silence_max, beat_at) = self.heartbeat.listen();
         // No longer than the limit of a running MCU: by then the core may have begun to run.
         self.silence.listen(beat_at, now, silence_max, RUNNING)
     }
 }
 
-impl Drop for Ear {
+impl Drop for HeartbeatMonitor {
     fn drop(&mut self) {
-        self.pulse.page[LISTENED_AT].store(0, Ordering::Relaxed);
+        self.heartbeat.page[LISTENED_AT].store(0, Ordering::Relaxed);
     }
 }
 
@@ -325,21 +325,21 @@ fn boottime() -> Duration {
     clock_gettime(ClockId::CLOCK_BOOTTIME).map_or(Duration::ZERO, Duration::from)
 }
 
-/// The program's ear. It listens to the guardian's sign of life while the guardian holds outputs.
-pub(crate) struct GuardianEar {
-    pulse: Pulse,
+/// The program's monitor. It listens to the guardian's sign of life while the guardian holds outputs.
+pub(crate) struct GuardianMonitor {
+    heartbeat: Heartbeat,
     silence: Option<Silence>,
     due: Duration,
 }
 
-impl GuardianEar {
-    pub(crate) fn new(pulse: Pulse) -> GuardianEar {
-        GuardianEar { pulse, silence: None, due: Duration::ZERO }
+impl GuardianMonitor {
+    pub(crate) fn new(heartbeat: Heartbeat) -> GuardianMonitor {
+        GuardianMonitor { heartbeat, silence: None, due: Duration::ZERO }
     }
 
     /// When to look next (CLOCK_MONOTONIC). `None` while the guardian holds nothing.
     pub(crate) fn due(&self) -> Option<Duration> {
-        let is_set = |word: usize| self.pulse.page[word].load(Ordering::Relaxed) != 0;
+        let is_set = |word: usize| self.heartbeat.page[word].load(Ordering::Relaxed) != 0;
         if is_set(UNANSWERED) {
             return Some(Duration::ZERO);
         }
@@ -349,14 +349,14 @@ impl GuardianEar {
     /// Whether the guardian is lost at `now`: it did not answer, or has been silent for
     /// [`GUARDIAN`].
     pub(crate) fn is_lost(&mut self, now: Duration) -> bool {
-        if self.pulse.page[UNANSWERED].load(Ordering::Relaxed) != 0 {
+        if self.heartbeat.page[UNANSWERED].load(Ordering::Relaxed) != 0 {
             return true;
         }
-        let sign = self.pulse.page[LISTENED_AT].load(Ordering::Relaxed);
+        let sign = self.heartbeat.page[LISTENED_AT].load(Ordering::Relaxed);
         if sign == 0 || now < self.due {
             return false;
         }
-        let clock = self.pulse.at(now);
+        let clock = self.heartbeat.at(now);
         let silence = self.silence.get_or_insert_with(|| Silence::new(sign, clock));
         let pause = silence.listen(sign, clock, GUARDIAN, GUARDIAN);
         self.due = now + pause.unwrap_or_default();
@@ -376,16 +376,16 @@ mod tests {
         Clock::from_ticks(ms * u64::from(CLOCK_FREQ) / 1000)
     }
 
-    fn pulse() -> Pulse {
-        let pulse = Pulse::new(Monotonic::start()).unwrap();
-        pulse.beat(at(0), false);
-        pulse
+    fn heartbeat() -> Heartbeat {
+        let heartbeat = Heartbeat::new(Monotonic::start()).unwrap();
+        heartbeat.beat(at(0), false);
+        heartbeat
     }
 
     /// After how many milliseconds a punctual listener hears that the heartbeat is missing, and how often it looked.
-    fn silent_after(ear: &mut Ear, from_ms: u64) -> (u64, u32) {
+    fn silent_after(monitor: &mut HeartbeatMonitor, from_ms: u64) -> (u64, u32) {
         let (mut ms, mut looks) = (from_ms, 0);
-        while let Some(pause) = ear.listen(at(ms)) {
+        while let Some(pause) = monitor.listen(at(ms)) {
             ms += pause.as_millis().max(1) as u64;
             looks += 1;
             assert!(looks < 1000);
@@ -395,141 +395,142 @@ mod tests {
 
     #[test]
     fn a_core_that_beats_is_not_silent_and_seldom_looked_for() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         let (mut look_ms, mut looks) = (0, 0);
         for ms in 0..60_000 {
             // As late as a core may be.
             if ms % 540 == 0 {
-                pulse.beat(at(ms), true);
+                heartbeat.beat(at(ms), true);
             }
             if ms >= look_ms {
-                look_ms = ms + ear.listen(at(ms)).unwrap_or_else(|| panic!("silent at {ms} ms")).as_millis() as u64 + 1;
+                look_ms =
+                    ms + monitor.listen(at(ms)).unwrap_or_else(|| panic!("silent at {ms} ms")).as_millis() as u64 + 1;
                 looks += 1;
             }
         }
         assert!(looks < 300, "{looks} looks in a minute");
         for ms in (60_000..120_000).step_by(BEAT.as_millis() as usize) {
-            pulse.beat(at(ms), true);
-            assert!(!pulse.is_silent(at(ms + 500)));
+            heartbeat.beat(at(ms), true);
+            assert!(!heartbeat.is_silent(at(ms + 500)));
         }
     }
 
     #[test]
     fn a_running_core_is_missed_before_600_ms_are_over() {
         for beat_ms in [0, 1, 150, 299, 549] {
-            let pulse = pulse();
-            let mut ear = Ear::new(pulse, at(0));
-            pulse.beat(at(0), true);
-            ear.listen(at(0)).unwrap();
-            pulse.beat(at(beat_ms), true);
-            let (after, looks) = silent_after(&mut ear, 550);
+            let heartbeat = heartbeat();
+            let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+            heartbeat.beat(at(0), true);
+            monitor.listen(at(0)).unwrap();
+            heartbeat.beat(at(beat_ms), true);
+            let (after, looks) = silent_after(&mut monitor, 550);
             let silence = Duration::from_millis(550 + after - beat_ms);
             assert!(silence + FINE >= RUNNING && silence <= RUNNING + FINE, "{silence:?}");
             assert!(looks <= 3, "{looks} looks");
-            assert!(pulse.is_silent(at(550 + after) + Ticks::from_ms(2)));
+            assert!(heartbeat.is_silent(at(550 + after) + Ticks::from_ms(2)));
         }
     }
 
     #[test]
     fn an_mcu_that_begins_to_run_is_watched_closely_at_once() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
-        let pause = ear.listen(at(0)).unwrap();
-        pulse.beat(at(1), true);
-        let (after, _) = silent_after(&mut ear, pause.as_millis() as u64);
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+        let pause = monitor.listen(at(0)).unwrap();
+        heartbeat.beat(at(1), true);
+        let (after, _) = silent_after(&mut monitor, pause.as_millis() as u64);
         assert!(pause.as_millis() as u64 + after <= 555);
     }
 
     #[test]
     fn a_core_that_is_configured_may_take_its_time() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
-        let (after, _) = silent_after(&mut ear, 0);
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+        let (after, _) = silent_after(&mut monitor, 0);
         assert!((29_990..30_010).contains(&after), "{after} ms");
-        assert_eq!(pulse.diagnosis(), "the core gave no sign of life for 30000 ms");
+        assert_eq!(heartbeat.diagnosis(), "the core gave no sign of life for 30000 ms");
     }
 
     #[test]
     fn what_the_listener_slept_through_is_no_silence() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
-        pulse.beat(at(0), true);
-        ear.listen(at(0)).unwrap();
-        pulse.beat(at(290), true);
-        ear.listen(at(550)).unwrap();
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+        heartbeat.beat(at(0), true);
+        monitor.listen(at(0)).unwrap();
+        heartbeat.beat(at(290), true);
+        monitor.listen(at(550)).unwrap();
         // The computer stood still for a minute, and the core is not awake yet.
-        let pause = ear.listen(at(60_000)).expect("it was not heard");
+        let pause = monitor.listen(at(60_000)).expect("it was not heard");
         assert!(pause >= Duration::from_millis(150), "{pause:?}");
         // A listener that never gets its turn in time still hears a core that hangs.
-        let looks = (61..80).take_while(|s| ear.listen(at(s * 1000)).is_some()).count();
+        let looks = (61..80).take_while(|s| monitor.listen(at(s * 1000)).is_some()).count();
         assert!((1..4).contains(&looks), "{looks}");
     }
 
     #[test]
     fn a_shutdown_value_that_is_owed_stops_the_heart() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
-        pulse.beat(at(0), true);
-        ear.listen(at(0)).unwrap();
-        pulse.owe("spi0", at(0));
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+        heartbeat.beat(at(0), true);
+        monitor.listen(at(0)).unwrap();
+        heartbeat.set_pending("spi0", at(0));
         for ms in (0..=900).step_by(100) {
             // The core itself continues.
-            pulse.beat(at(ms), false);
-            assert!(ear.listen(at(ms)).is_some(), "{ms} ms");
+            heartbeat.beat(at(ms), false);
+            assert!(monitor.listen(at(ms)).is_some(), "{ms} ms");
         }
         // The first output has its value, and another has not: the time goes on.
-        pulse.owe("pwmchip10/pwm1", at(950));
-        pulse.beat(at(1000), false);
-        let (after, _) = silent_after(&mut ear, 901);
+        heartbeat.set_pending("pwmchip10/pwm1", at(950));
+        heartbeat.beat(at(1000), false);
+        let (after, _) = silent_after(&mut monitor, 901);
         assert!((98..=103).contains(&after), "{after} ms");
         let diagnosis = "pwmchip10/pwm1 is not at its shutdown value within 1000 ms: ";
-        assert!(pulse.diagnosis().starts_with(diagnosis), "{}", pulse.diagnosis());
+        assert!(heartbeat.diagnosis().starts_with(diagnosis), "{}", heartbeat.diagnosis());
         // It was only slow.
-        pulse.paid(at(1010));
-        assert!(ear.listen(at(1010)).is_some());
-        assert_eq!(pulse.listen().0, IDLE);
+        heartbeat.clear_pending(at(1010));
+        assert!(monitor.listen(at(1010)).is_some());
+        assert_eq!(heartbeat.listen().0, IDLE);
     }
 
     #[test]
     fn what_the_core_was_at_before_the_mcu_owed_anything_does_not_count() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         // The core fails to open a device, and the MCU stops.
         for ms in (0..4000).step_by(500) {
-            assert!(ear.listen(at(ms)).is_some());
+            assert!(monitor.listen(at(ms)).is_some());
         }
-        pulse.owe("pwmchip0/pwm0", at(4000));
-        let (after, _) = silent_after(&mut ear, 4000);
+        heartbeat.set_pending("pwmchip0/pwm0", at(4000));
+        let (after, _) = silent_after(&mut monitor, 4000);
         assert!((998..=1003).contains(&after), "{after} ms");
     }
 
     #[test]
     fn a_running_mcu_that_stood_still_is_told_so_once() {
-        let pulse = pulse();
-        pulse.beat(at(0), true);
-        assert!(pulse.standstill(at(990)).is_none());
-        let shutdown = pulse.standstill(at(1010)).unwrap();
+        let heartbeat = heartbeat();
+        heartbeat.beat(at(0), true);
+        assert!(heartbeat.standstill(at(990)).is_none());
+        let shutdown = heartbeat.standstill(at(1010)).unwrap();
         assert_eq!(shutdown.reason, reason::TIMER_PAST);
         assert!(shutdown.trouble.cause.contains("stood still for 10"), "{shutdown}");
-        pulse.beat(at(1010), true);
-        assert!(pulse.standstill(at(1011)).is_none());
+        heartbeat.beat(at(1010), true);
+        assert!(heartbeat.standstill(at(1011)).is_none());
         // An MCU that is being configured may take its time, and reports nothing.
-        pulse.beat(at(1010), false);
-        assert!(pulse.standstill(at(9000)).is_none());
+        heartbeat.beat(at(1010), false);
+        assert!(heartbeat.standstill(at(9000)).is_none());
     }
 
     #[test]
     fn a_running_mcu_that_was_suspended_is_told_so_once() {
-        let pulse = pulse();
-        let mut ear = Ear::new(pulse, at(0));
-        pulse.beat(at(0), true);
-        ear.listen(at(0)).unwrap();
-        assert!(pulse.standstill(at(1)).is_none(), "this computer was not suspended meanwhile");
-        pulse.tell_suspension(Duration::from_secs(60));
-        let shutdown = pulse.standstill(at(3)).unwrap();
+        let heartbeat = heartbeat();
+        let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
+        heartbeat.beat(at(0), true);
+        monitor.listen(at(0)).unwrap();
+        assert!(heartbeat.standstill(at(1)).is_none(), "this computer was not suspended meanwhile");
+        heartbeat.tell_suspension(Duration::from_secs(60));
+        let shutdown = heartbeat.standstill(at(3)).unwrap();
         assert!(shutdown.trouble.cause.contains("suspended for 60000 ms"), "{shutdown}");
-        assert!(pulse.standstill(at(4)).is_none());
+        assert!(heartbeat.standstill(at(4)).is_none());
     }
 
     #[test]
@@ -544,24 +545,24 @@ mod tests {
     }
 
     /// A time of CLOCK_MONOTONIC.
-    fn time(pulse: Pulse, ms: u64) -> Duration {
-        pulse.clock.duration_of(at(ms))
+    fn time(heartbeat: Heartbeat, ms: u64) -> Duration {
+        heartbeat.clock.duration_of(at(ms))
     }
 
     /// The core's beat and the guardian's look, at each instant of `ms`.
-    fn listen_at(ear: &mut Ear, ms: impl IntoIterator<Item = u64>) {
+    fn listen_at(monitor: &mut HeartbeatMonitor, ms: impl IntoIterator<Item = u64>) {
         for ms in ms {
-            ear.pulse.beat(at(ms), true);
-            ear.listen(at(ms)).unwrap();
+            monitor.heartbeat.beat(at(ms), true);
+            monitor.listen(at(ms)).unwrap();
         }
     }
 
     #[test]
     fn a_guardian_that_holds_outputs_is_missed_after_two_seconds() {
-        let pulse = pulse();
-        let mut program = GuardianEar::new(pulse);
+        let heartbeat = heartbeat();
+        let mut program = GuardianMonitor::new(heartbeat);
         assert_eq!(program.due(), None, "it holds nothing");
-        let mut guardian = Ear::new(pulse, at(0));
+        let mut guardian = HeartbeatMonitor::new(heartbeat, at(0));
         listen_at(&mut guardian, [0]);
         let (mut ms, mut looks) = (0, 0);
         // It listens until the tenth second, then it is stopped.
@@ -570,9 +571,9 @@ mod tests {
             if ms % 500 == 0 && ms <= 10_000 {
                 listen_at(&mut guardian, [ms]);
             }
-            if program.due().is_some_and(|due| time(pulse, ms) >= due) {
+            if program.due().is_some_and(|due| time(heartbeat, ms) >= due) {
                 looks += 1;
-                if program.is_lost(time(pulse, ms)) {
+                if program.is_lost(time(heartbeat, ms)) {
                     break ms;
                 }
             }
@@ -586,43 +587,43 @@ mod tests {
 
     #[test]
     fn a_guardian_that_stood_still_together_with_the_program_is_not_missed() {
-        let pulse = pulse();
-        let mut program = GuardianEar::new(pulse);
-        let mut guardian = Ear::new(pulse, at(0));
+        let heartbeat = heartbeat();
+        let mut program = GuardianMonitor::new(heartbeat);
+        let mut guardian = HeartbeatMonitor::new(heartbeat, at(0));
         listen_at(&mut guardian, (0..=5000).step_by(500));
-        assert!(!program.is_lost(time(pulse, 5100)));
+        assert!(!program.is_lost(time(heartbeat, 5100)));
         // Both are frozen for a minute, and the program continues first.
-        assert!(!program.is_lost(time(pulse, 65_000)));
-        assert!(program.due().unwrap() > time(pulse, 66_000));
+        assert!(!program.is_lost(time(heartbeat, 65_000)));
+        assert!(program.due().unwrap() > time(heartbeat, 66_000));
         listen_at(&mut guardian, [65_010]);
         assert!(!program.is_lost(program.due().unwrap()));
     }
 
     #[test]
     fn a_guardian_that_does_not_answer_is_lost_at_once() {
-        let pulse = pulse();
-        let mut program = GuardianEar::new(pulse);
-        pulse.miss_answer();
+        let heartbeat = heartbeat();
+        let mut program = GuardianMonitor::new(heartbeat);
+        heartbeat.miss_answer();
         assert_eq!(program.due(), Some(Duration::ZERO));
-        assert!(program.is_lost(time(pulse, 1)));
+        assert!(program.is_lost(time(heartbeat, 1)));
     }
 
     #[test]
     fn workers_come_and_go() {
-        let pulse = pulse();
+        let heartbeat = heartbeat();
         let places = (SHARED_WORDS - WORKERS) / SLOT_WORDS;
         for round in 0..2 {
-            let workers: Vec<_> = (0..places).map(|n| pulse.worker(&format!("spi{n}")).unwrap()).collect();
-            assert!(pulse.worker("spi").is_none(), "round {round}");
+            let workers: Vec<_> = (0..places).map(|n| heartbeat.worker(&format!("spi{n}")).unwrap()).collect();
+            assert!(heartbeat.worker("spi").is_none(), "round {round}");
             workers[3].begin();
-            let now = pulse.now();
-            let later = pulse.at(pinion_linux::clock::monotonic() + Duration::from_secs(11));
-            assert_eq!(pulse.stuck(now, Duration::from_secs(10)), None);
-            assert_eq!(pulse.stuck(later, Duration::from_secs(10)).as_deref(), Some("spi3"));
+            let now = heartbeat.now();
+            let later = heartbeat.at(pinion_linux::clock::monotonic() + Duration::from_secs(11));
+            assert_eq!(heartbeat.stuck(now, Duration::from_secs(10)), None);
+            assert_eq!(heartbeat.stuck(later, Duration::from_secs(10)).as_deref(), Some("spi3"));
             workers[3].end();
-            assert_eq!(pulse.stuck(later, Duration::from_secs(10)), None);
+            assert_eq!(heartbeat.stuck(later, Duration::from_secs(10)), None);
         }
-        let long = pulse.worker("a bus whose name is longer than is shown").unwrap();
+        let long = heartbeat.worker("a bus whose name is longer than is shown").unwrap();
         assert_eq!(long.slot.name().get(), "a bus whose name is longer t");
     }
 }

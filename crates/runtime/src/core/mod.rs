@@ -23,14 +23,14 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_linux::clock::monotonic;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::vlq::Reader;
-use pinion_sync::calls::Progress;
+use pinion_sync::progress::Progress;
 
-use crate::core::busy_poll::Lookout;
-use crate::core::heartbeat::{BEAT, Pulse};
+use crate::core::busy_poll::PollBudget;
+use crate::core::heartbeat::{BEAT, Heartbeat};
 use crate::core::responses::LinkWake;
 use crate::core::wakeup::{Waiter, Woken};
-use crate::recorder::Tape;
-use crate::status::Teller;
+use crate::recorder::TraceWriter;
+use crate::status::SnapshotWriter;
 
 /// The payload of a message block on its way to the core.
 #[derive(Clone, Copy)]
@@ -96,7 +96,7 @@ pub(crate) struct Core {
     clock: Arc<dyn TimeSource>,
     requests: Consumer<Request>,
     waiter: Waiter,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     progress: Arc<Progress>,
     wake: Arc<LinkWake>,
     /// The present block, and the offset of its next command.
@@ -106,11 +106,11 @@ pub(crate) struct Core {
     stops_taken: u32,
     /// The link was not yet woken for some finished blocks.
     untold: bool,
-    lookout: Lookout,
+    polling: PollBudget,
     /// The output that the guardian knows to be owed its shutdown value.
     debtor: Option<String>,
-    teller: Teller,
-    tape: Tape,
+    snapshots: SnapshotWriter,
+    trace_writer: TraceWriter,
 }
 
 /// The parts of the core.
@@ -119,11 +119,11 @@ pub(crate) struct Parts {
     pub(crate) clock: Arc<dyn TimeSource>,
     pub(crate) requests: Consumer<Request>,
     pub(crate) waiter: Waiter,
-    pub(crate) pulse: Pulse,
+    pub(crate) heartbeat: Heartbeat,
     pub(crate) progress: Arc<Progress>,
     pub(crate) wake: Arc<LinkWake>,
-    pub(crate) teller: Teller,
-    pub(crate) tape: Tape,
+    pub(crate) snapshots: SnapshotWriter,
+    pub(crate) trace_writer: TraceWriter,
     /// There is a second processor, so that the core may poll.
     pub(crate) may_poll: bool,
 }
@@ -146,29 +146,30 @@ pub(crate) enum Left {
 
 impl Core {
     pub(crate) fn new(parts: Parts) -> Core {
-        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll } = parts;
+        let Parts { mcu, clock, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll } =
+            parts;
         Core {
             untold: false,
-            lookout: Lookout::new(may_poll, clock.now()),
+            polling: PollBudget::new(may_poll, clock.now()),
             mcu,
             clock,
             requests,
             waiter,
-            pulse,
+            heartbeat,
             progress,
             wake,
             block: None,
             yielded: 0,
             stops_taken: 0,
             debtor: None,
-            teller,
-            tape,
+            snapshots,
+            trace_writer,
         }
     }
 
     /// Runs until it is asked to quit.
     pub(crate) fn run(mut self) -> Left {
-        self.tape.start();
+        self.trace_writer.start();
         let mut busy_since = self.clock.now();
         let mut was_shutdown = false;
         loop {
@@ -179,10 +180,10 @@ impl Core {
                 }
             }
             let behind = self.mcu.run_timers();
-            if let Some(standstill) = self.pulse.standstill(self.mcu.last_read()) {
+            if let Some(standstill) = self.heartbeat.standstill(self.mcu.last_read()) {
                 self.mcu.shut_down(standstill);
             }
-            self.pulse.beat(self.mcu.last_read(), self.mcu.is_running());
+            self.heartbeat.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
             self.tell_debts();
             self.waiter.ran(self.mcu.last_read());
@@ -197,7 +198,7 @@ impl Core {
                 match self.run_commands(behind) {
                     Turn::Done => {
                         let span = if self.mcu.is_held() { ANSWER } else { NEXT_COMMAND };
-                        self.lookout.expect(self.mcu.last_read(), span);
+                        self.polling.expect(self.mcu.last_read(), span);
                         continue;
                     }
                     Turn::Quit => {
@@ -216,8 +217,8 @@ impl Core {
                 continue;
             }
             self.record();
-            if self.teller.is_asked() && !soon(deadline, now) {
-                self.teller.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
+            if self.snapshots.is_asked() && !soon(deadline, now) {
+                self.snapshots.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
                 continue;
             }
             if self.untold && self.mcu.is_held() && self.requests.slots() <= FEW && !soon(deadline, now) {
@@ -225,7 +226,7 @@ impl Core {
                 self.wake.wake();
                 continue;
             }
-            if self.lookout.goes_on(now)
+            if self.polling.goes_on(now)
                 && self.waiter.has_time_to_spare()
                 && may_yield(self.waiter.is_realtime(), now, deadline)
             {
@@ -270,22 +271,22 @@ impl Core {
     #[inline]
     fn record(&mut self) {
         if let Some(sleep) = self.waiter.take_sleep() {
-            self.tape.woke(sleep);
+            self.trace_writer.woke(sleep);
         }
-        self.tape.turn(&mut self.mcu, !self.waiter.is_realtime());
+        self.trace_writer.turn(&mut self.mcu, !self.waiter.is_realtime());
     }
 
     /// Tells the guardian which output is owed its shutdown value.
     fn tell_debts(&mut self) {
         if !self.mcu.owes() {
             if self.debtor.take().is_some() {
-                self.pulse.paid(self.mcu.last_read());
+                self.heartbeat.clear_pending(self.mcu.last_read());
             }
             return;
         }
         let debtor = self.mcu.debtor();
         if debtor != self.debtor.as_deref() {
-            self.pulse.owe(debtor.unwrap_or_default(), self.mcu.last_read());
+            self.heartbeat.set_pending(debtor.unwrap_or_default(), self.mcu.last_read());
             self.debtor = debtor.map(str::to_owned);
         }
     }
@@ -297,12 +298,12 @@ impl Core {
             self.mcu.run_timers();
             self.mcu.run_workers();
             self.tell_debts();
-            self.pulse.beat(self.mcu.now(), false);
+            self.heartbeat.beat(self.mcu.now(), false);
             thread::park_timeout(Duration::from_millis(1));
         }
         let left = self.mcu.debtor().map_or(Left::Safe, |debtor| Left::Owing(debtor.to_owned()));
         // This beat gives workers and devices time to end.
-        self.pulse.beat(self.mcu.now(), false);
+        self.heartbeat.beat(self.mcu.now(), false);
         left
     }
 
@@ -363,7 +364,7 @@ impl Core {
             Some(block) => block,
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
-                    self.tape.began(self.mcu.last_read(), self.progress.begin());
+                    self.trace_writer.began(self.mcu.last_read(), self.progress.begin());
                     (payload, 0)
                 }
                 Ok(request) => return self.serve(request),
@@ -380,7 +381,7 @@ impl Core {
             self.mcu.execute(&mut reader);
             count += 1;
         }
-        self.tape.ran(began, &bytes[at..], count);
+        self.trace_writer.ran(began, &bytes[at..], count);
         at = bytes.len() - reader.rest().len();
         if at < bytes.len() || self.mcu.keeps_block() {
             self.progress.hold(self.mcu.is_held());
@@ -561,11 +562,11 @@ mod tests {
             let wake = Arc::new(LinkWake::new().unwrap());
             let core_wake = wake.clone();
             let thread = thread::spawn(move || {
-                let pulse = Pulse::new(monotonic).unwrap();
+                let heartbeat = Heartbeat::new(monotonic).unwrap();
                 let recording = Recording::of_a_test();
-                let (_recorder, tape) = Recorder::new(recording.clone()).unwrap();
+                let (_recorder, trace_writer) = Recorder::new(recording.clone()).unwrap();
                 let workers =
-                    Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse, recording, true);
+                    Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), heartbeat, recording, true);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -577,10 +578,22 @@ mod tests {
                 let (limits, processors) = (MarginLimits { min: early, max: early }, Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
-                let teller = status::ends().0;
+                let snapshots = status::ends().0;
                 let may_poll = true;
                 let requests = inbox;
-                Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll }).run()
+                Core::new(Parts {
+                    mcu,
+                    clock,
+                    requests,
+                    waiter,
+                    heartbeat,
+                    progress,
+                    wake,
+                    snapshots,
+                    trace_writer,
+                    may_poll,
+                })
+                .run()
             });
             let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
             rig.run("allocate_oids count=%c", &[3]);
@@ -666,7 +679,7 @@ mod tests {
         let config = ["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000"];
         let mut rig = pinion_testbench::rig::Rig::with_workers(50_000, &config);
         let progress = Progress::default();
-        let (mut inlet, requests) = RingBuffer::new(1);
+        let (mut reader, requests) = RingBuffer::new(1);
         let called = |mcu: &Mcu, block: Option<&(Payload, usize)>| {
             Calls { core: &progress, stops_taken: 0, mcu, block, requests: &requests }.any()
         };
@@ -675,7 +688,7 @@ mod tests {
 
         assert!(!called(&rig.mcu, None));
         assert!(called(&rig.mcu, Some(&other)), "the rest of a block");
-        inlet.push(Request::Run(other.0)).ok().unwrap();
+        reader.push(Request::Run(other.0)).ok().unwrap();
         assert!(called(&rig.mcu, None), "another block");
 
         rig.begin("spi_send oid=0 data=00");

@@ -16,7 +16,8 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use pinion_firmware::lateness::us;
 use pinion_firmware::mcu::{Note, Outbox};
 use pinion_firmware::shutdown::{Shutdown, reason};
-use pinion_sync::calls::{Doze, Progress};
+use pinion_sync::progress::Progress;
+use pinion_sync::sleep_flag::SleepFlag;
 
 /// Size of the ring of responses. Some 1,000 responses fit.
 const RING_BYTES: usize = 1 << 16;
@@ -34,19 +35,19 @@ const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 
 /// Wakes the link. Costs a system call only if the link sleeps.
 pub(crate) struct LinkWake {
-    doze: Doze,
+    sleep_flag: SleepFlag,
     event: EventFd,
 }
 
 impl LinkWake {
     pub(crate) fn new() -> io::Result<LinkWake> {
         let event = EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?;
-        Ok(LinkWake { doze: Doze::default(), event })
+        Ok(LinkWake { sleep_flag: SleepFlag::default(), event })
     }
 
     /// The core calls this after it has put something into a ring.
     pub(crate) fn wake(&self) {
-        if self.doze.is_to_be_woken() {
+        if self.sleep_flag.is_to_be_woken() {
             // The write can fail only if the counter is full of wake-ups, and then the link wakes, too.
             let _ = self.event.write(1);
         }
@@ -54,12 +55,12 @@ impl LinkWake {
 
     /// The link calls this before it sleeps. After this it must look at the rings once more.
     pub(crate) fn sleeping(&self) {
-        self.doze.begin();
+        self.sleep_flag.begin();
     }
 
     /// The link calls this after its sleep. `called`: its event was readable.
     pub(crate) fn awake(&self, called: bool) {
-        self.doze.end();
+        self.sleep_flag.end();
         if called {
             let _ = self.event.read();
         }
@@ -71,7 +72,7 @@ impl LinkWake {
 }
 
 /// The core's end of the rings.
-pub(crate) struct Outlet {
+pub(crate) struct ResponseWriter {
     responses: Producer<u8>,
     lines: Producer<u8>,
     wake: Arc<LinkWake>,
@@ -79,18 +80,18 @@ pub(crate) struct Outlet {
 }
 
 /// The link's end of the rings.
-pub(crate) struct Inlet {
+pub(crate) struct ResponseReader {
     responses: Consumer<u8>,
     lines: Consumer<u8>,
     payload: Vec<u8>,
 }
 
 /// Makes the rings, and returns both ends.
-pub(crate) fn outlet(wake: Arc<LinkWake>, progress: Arc<Progress>) -> (Outlet, Inlet) {
+pub(crate) fn response_ring(wake: Arc<LinkWake>, progress: Arc<Progress>) -> (ResponseWriter, ResponseReader) {
     let (to_host, responses) = RingBuffer::new(RING_BYTES);
     let (to_log, lines) = RingBuffer::new(LINES_BYTES);
-    let inlet = Inlet { responses, lines, payload: vec![0; usize::from(u16::MAX)] };
-    (Outlet { responses: to_host, lines: to_log, wake, progress }, inlet)
+    let reader = ResponseReader { responses, lines, payload: vec![0; usize::from(u16::MAX)] };
+    (ResponseWriter { responses: to_host, lines: to_log, wake, progress }, reader)
 }
 
 /// Puts a record into a ring as a whole, or drops it if it does not fit.
@@ -109,7 +110,7 @@ fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
     Some(to)
 }
 
-impl Outlet {
+impl ResponseWriter {
     /// Puts a line into its ring, or drops it if fewer than `spare` bytes would stay free. The log limits the lines of
     /// one kind. The first `kind` bytes name it.
     fn line(&mut self, kind: usize, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
@@ -132,7 +133,7 @@ impl Outlet {
     }
 }
 
-impl Outbox for Outlet {
+impl Outbox for ResponseWriter {
     fn send(&mut self, payload: &[u8]) {
         let mut head = [0; HEAD_BYTES];
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
@@ -187,7 +188,7 @@ impl std::fmt::Display for Kinds<'_> {
     }
 }
 
-impl Inlet {
+impl ResponseReader {
     /// The payload of the next response, and how many blocks the core had begun when it sent the response.
     pub(crate) fn response(&mut self) -> Option<(&[u8], u32)> {
         let mut head = [0; HEAD_BYTES];
@@ -222,10 +223,10 @@ impl Inlet {
 mod tests {
     use super::*;
 
-    fn ends() -> (Outlet, Inlet, Arc<Progress>) {
+    fn ends() -> (ResponseWriter, ResponseReader, Arc<Progress>) {
         let progress = Arc::new(Progress::default());
-        let (outlet, inlet) = outlet(Arc::new(LinkWake::new().unwrap()), progress.clone());
-        (outlet, inlet, progress)
+        let (response_ring, reader) = response_ring(Arc::new(LinkWake::new().unwrap()), progress.clone());
+        (response_ring, reader, progress)
     }
 
     #[test]
@@ -236,36 +237,36 @@ mod tests {
 
     #[test]
     fn what_the_host_does_not_read_is_dropped_and_the_reason_of_a_stop_is_not() {
-        let (mut outlet, mut inlet, progress) = ends();
+        let (mut response_ring, mut reader, progress) = ends();
         progress.begin();
-        outlet.send(b"one");
-        assert_eq!(inlet.response(), Some((&b"one"[..], 1)));
+        response_ring.send(b"one");
+        assert_eq!(reader.response(), Some((&b"one"[..], 1)));
         for _ in 0..RING_BYTES {
-            outlet.send(&[7; 60]);
+            response_ring.send(&[7; 60]);
         }
-        outlet.note(Note::Shutdown(&Shutdown::because(reason::ADC_READ, "oid 3")));
-        assert!(inlet.has_line());
-        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: Error on analog read: oid 3".into(), 30)));
-        assert_eq!(inlet.line(), None);
+        response_ring.note(Note::Shutdown(&Shutdown::because(reason::ADC_READ, "oid 3")));
+        assert!(reader.has_line());
+        assert_eq!(reader.line(), Some((Level::Error, "shutdown: Error on analog read: oid 3".into(), 30)));
+        assert_eq!(reader.line(), None);
         let mut whole = 0;
-        while let Some((response, 1)) = inlet.response() {
+        while let Some((response, 1)) = reader.response() {
             assert_eq!(response, [7; 60]);
             whole += 1;
         }
         assert_eq!(whole, RING_BYTES / (HEAD_BYTES + 60));
-        assert!(!inlet.has_response());
+        assert!(!reader.has_response());
     }
 
     #[test]
     fn troubles_leave_room_for_the_reason_of_a_stop() {
-        let (mut outlet, mut inlet, _) = ends();
+        let (mut response_ring, mut reader, _) = ends();
         let trouble = Shutdown::because(reason::PWM_WRITE, "no ".repeat(LINE_BYTES));
         for _ in 0..256 {
-            outlet.note(Note::Trouble(&trouble));
+            response_ring.note(Note::Trouble(&trouble));
         }
         let reason = format!("M112 {}", "of this host ".repeat(LINE_BYTES));
-        outlet.note(Note::Shutdown(&Shutdown::because(reason::COMMAND_REQUEST, reason)));
-        let mut lines: Vec<_> = std::iter::from_fn(|| inlet.line()).collect();
+        response_ring.note(Note::Shutdown(&Shutdown::because(reason::COMMAND_REQUEST, reason)));
+        let mut lines: Vec<_> = std::iter::from_fn(|| reader.line()).collect();
         let (level, line, _) = lines.pop().unwrap();
         assert_eq!(level, Level::Info);
         assert!(line.starts_with("shutdown: Command request: M112 of this host"), "{line}");
@@ -275,12 +276,12 @@ mod tests {
 
     #[test]
     fn what_was_asked_for_is_no_warning() {
-        let (mut outlet, mut inlet, _) = ends();
+        let (mut response_ring, mut reader, _) = ends();
         let end = Shutdown::because(reason::FORCE_SHUTDOWN, "the end");
-        outlet.note(Note::Shutdown(&end));
-        outlet.note(Note::Trouble(&end));
-        assert_eq!(inlet.line(), Some((Level::Info, "shutdown: Force shutdown command: the end".into(), 32)));
+        response_ring.note(Note::Shutdown(&end));
+        response_ring.note(Note::Trouble(&end));
+        assert_eq!(reader.line(), Some((Level::Info, "shutdown: Force shutdown command: the end".into(), 32)));
         let line = "while shut down: Force shutdown command: the end".to_owned();
-        assert_eq!(inlet.line(), Some((Level::Info, line, 39)));
+        assert_eq!(reader.line(), Some((Level::Info, line, 39)));
     }
 }

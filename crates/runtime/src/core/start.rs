@@ -13,9 +13,9 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, Mcu};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
-use pinion_sync::calls::Progress;
+use pinion_sync::progress::Progress;
 
-use crate::core::heartbeat::Pulse;
+use crate::core::heartbeat::Heartbeat;
 use crate::core::responses::{self, LinkWake};
 use crate::core::wakeup::{MarginLimits, Waiter};
 use crate::core::workers::Threads;
@@ -23,8 +23,8 @@ use crate::core::{Core, Left, Parts};
 use crate::link::core_end::CoreEnd;
 use crate::link::ledger::Ledger;
 use crate::process::realtime::{self, Processors, Role, Scheduling};
-use crate::recorder::{Recording, Tape};
-use crate::status::Teller;
+use crate::recorder::{Recording, TraceWriter};
+use crate::status::SnapshotWriter;
 use crate::trouble::started;
 
 /// Highest number of blocks between link and core: four times the blocks that a host may have under way.
@@ -37,10 +37,10 @@ pub(crate) struct CoreThread {
     /// The dialect that the MCU speaks before a host comes.
     pub(crate) dialect: Arc<Dialect>,
     pub(crate) wake: Arc<LinkWake>,
-    pub(crate) pulse: Pulse,
-    pub(crate) teller: Teller,
+    pub(crate) heartbeat: Heartbeat,
+    pub(crate) snapshots: SnapshotWriter,
     pub(crate) recording: Recording,
-    pub(crate) tape: Tape,
+    pub(crate) trace_writer: TraceWriter,
     pub(crate) processors: Processors,
     pub(crate) margin: MarginLimits,
     pub(crate) realtime: bool,
@@ -50,7 +50,7 @@ impl CoreThread {
     /// Starts the thread, and returns the link's end of it.
     pub(crate) fn start(self) -> Result<(JoinHandle<Left>, CoreEnd), Trouble> {
         let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
-        let (outlet, inlet) = responses::outlet(wake.clone(), progress.clone());
+        let (response_ring, reader) = responses::response_ring(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
         // Count the processors before the core is confined to one.
         let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
@@ -61,10 +61,10 @@ impl CoreThread {
                 timing,
                 dialect,
                 wake,
-                pulse,
-                teller,
+                heartbeat,
+                snapshots,
                 recording,
-                tape,
+                trace_writer,
                 processors,
                 margin,
                 realtime,
@@ -83,14 +83,26 @@ impl CoreThread {
                 }
             });
             let clock = timing.clock.clone();
-            let workers = Threads::new(thread::current(), prepare, clock.clone(), pulse, recording, may_poll);
-            let mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(outlet));
+            let workers = Threads::new(thread::current(), prepare, clock.clone(), heartbeat, recording, may_poll);
+            let mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(response_ring));
             let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
             let (requests, progress) = (inbox, core_progress);
-            Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll }).run()
+            Core::new(Parts {
+                mcu,
+                clock,
+                requests,
+                waiter,
+                heartbeat,
+                progress,
+                wake,
+                snapshots,
+                trace_writer,
+                may_poll,
+            })
+            .run()
         }))?;
         let thread = core.thread().clone();
         let ledger = Ledger::default();
-        Ok((core, CoreEnd { requests, thread, inlet, progress, wake, ledger, may_poll }))
+        Ok((core, CoreEnd { requests, thread, reader, progress, wake, ledger, may_poll }))
     }
 }

@@ -21,8 +21,8 @@ use pinion_linux::clock::{monotonic, wait_until};
 use pinion_trace::event::Event;
 use pinion_trace::ring::Writer;
 
-use crate::core::busy_poll::Lookout;
-use crate::core::heartbeat::{JobClock, Pulse};
+use crate::core::busy_poll::PollBudget;
+use crate::core::heartbeat::{Heartbeat, JobClock};
 use crate::recorder::{Recording, span};
 
 /// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
@@ -52,36 +52,38 @@ pub(crate) struct Threads {
     core: Thread,
     prepare: Prepare,
     clock: Arc<dyn TimeSource>,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     recording: Recording,
     may_poll: bool,
     workers: Vec<Worker>,
 }
 
 impl Threads {
-    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `pulse` since when it runs the
+    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `heartbeat` since when it runs the
     /// errand. It records its errands in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(crate) fn new(
         core: Thread,
         prepare: Prepare,
         clock: Arc<dyn TimeSource>,
-        pulse: Pulse,
+        heartbeat: Heartbeat,
         recording: Recording,
         may_poll: bool,
     ) -> Threads {
-        Threads { core, prepare, clock, pulse, recording, may_poll, workers: Vec::new() }
+        Threads { core, prepare, clock, heartbeat, recording, may_poll, workers: Vec::new() }
     }
 
     fn spawn(&self, bus: &str) -> Result<Worker, Shutdown> {
         let (jobs, inbox) = RingBuffer::new(QUEUE_JOBS);
         let (outbox, done) = RingBuffer::new(QUEUE_JOBS);
         let quit = Arc::new(AtomicBool::new(false));
-        let shown = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
+        let shown =
+            self.heartbeat.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
         let core = self.core.clone();
         let clock = self.clock.clone();
-        let lookout = Lookout::new(self.may_poll, clock.now());
-        let tape = self.recording.worker(bus);
-        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, lookout, tape };
+        let polling = PollBudget::new(self.may_poll, clock.now());
+        let trace_writer = self.recording.worker(bus);
+        let server =
+            Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, polling, trace_writer };
         let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
@@ -184,8 +186,8 @@ struct Server {
     core: Thread,
     clock: Arc<dyn TimeSource>,
     shown: JobClock,
-    lookout: Lookout,
-    tape: Option<Writer>,
+    polling: PollBudget,
+    trace_writer: Option<Writer>,
 }
 
 impl Server {
@@ -201,7 +203,7 @@ impl Server {
             match self.jobs.pop() {
                 Ok((job, submitted)) => self.serve(job, submitted),
                 Err(_) if ending => return,
-                Err(_) if self.lookout.goes_on(self.clock.now()) => thread::yield_now(),
+                Err(_) if self.polling.goes_on(self.clock.now()) => thread::yield_now(),
                 Err(_) => thread::park(),
             }
         }
@@ -224,13 +226,13 @@ impl Server {
         }
         // Samples, which timers ask for, come at their own pace.
         if holds {
-            self.lookout.expect(ended, NEXT_JOB);
+            self.polling.expect(ended, NEXT_JOB);
         }
     }
 
     fn record(&mut self, at: Clock, event: Event) {
-        if let Some(tape) = &mut self.tape {
-            tape.write(at, event);
+        if let Some(trace_writer) = &mut self.trace_writer {
+            trace_writer.write(at, event);
         }
     }
 }
@@ -289,9 +291,15 @@ mod tests {
     /// How often a worker reads its clock after it got a job, until it sleeps.
     fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
         let clock = Arc::new(Looks::default());
-        let pulse = Pulse::new(Monotonic::start()).unwrap();
-        let mut threads =
-            Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, Recording::of_a_test(), may_poll);
+        let heartbeat = Heartbeat::new(Monotonic::start()).unwrap();
+        let mut threads = Threads::new(
+            thread::current(),
+            Arc::new(|| ()),
+            clock.clone(),
+            heartbeat,
+            Recording::of_a_test(),
+            may_poll,
+        );
         let worker = threads.start("spi0").unwrap();
         // It reads the clock once when it falls asleep.
         let asleep = || {
@@ -324,8 +332,8 @@ mod tests {
     fn threads() -> Threads {
         let clock = Monotonic::start();
         {
-            let pulse = Pulse::new(clock).unwrap();
-            Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), pulse, Recording::of_a_test(), true)
+            let heartbeat = Heartbeat::new(clock).unwrap();
+            Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
         }
     }
 

@@ -7,7 +7,7 @@
 //!
 //! - when the program's end of their socket closes without a goodbye, or its pidfd says that it is gone: SIGKILL, a
 //!   crash, the OOM killer;
-//! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are held: within 600 ms of
+//! - when the core leaves no heartbeat in a page that both share (`heartbeat.rs`), while outputs are held: within 600 ms of
 //!   the last heartbeat while the MCU runs.
 //!
 //! Then it drives the outputs, and kills the program if it still lives. It drives the outputs once more: the core may
@@ -50,7 +50,7 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{monotonic, wait_until};
 use pinion_linux::sys;
 
-use crate::core::heartbeat::{GuardianEar, Pulse};
+use crate::core::heartbeat::{GuardianMonitor, Heartbeat};
 use crate::process::forked::THREADS_MAX;
 use crate::recorder::Recording;
 use crate::trouble::{NO_PROCESS, refused};
@@ -70,7 +70,7 @@ const ANSWER_S: i64 = 5;
 pub struct Guardian {
     socket: Arc<OwnedFd>,
     pid: Pid,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
 }
 
 impl Guardian {
@@ -86,27 +86,27 @@ impl Guardian {
     }
 
     fn try_start(recording: &Recording) -> io::Result<Guardian> {
-        let pulse = Pulse::new(recording.clock())?;
+        let heartbeat = Heartbeat::new(recording.clock())?;
         let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(ANSWER_S))?;
         let program = Program::new(getpid());
         let pid = sys::fork(THREADS_MAX, move || {
             watcher::settle(recording.is_realtime(), &theirs, &program);
-            Watcher::new(theirs, program, pulse, recording.clone()).watch();
+            Watcher::new(theirs, program, heartbeat, recording.clone()).watch();
             0
         })?;
         // The guardian answers once it ignores the signals that end a program.
         answer(&socket)?;
-        Ok(Guardian { socket: Arc::new(socket), pid, pulse })
+        Ok(Guardian { socket: Arc::new(socket), pid, heartbeat })
     }
 
     /// The board gives its outputs to this.
     pub fn guard(&self) -> Box<dyn Guard> {
-        Box::new(Lifeline { socket: self.socket.clone(), pulse: self.pulse, lost: false })
+        Box::new(Lifeline { socket: self.socket.clone(), heartbeat: self.heartbeat, lost: false })
     }
 
-    pub(super) fn pulse(&self) -> Pulse {
-        self.pulse
+    pub(super) fn heartbeat(&self) -> Heartbeat {
+        self.heartbeat
     }
 
     /// Its process.
@@ -116,7 +116,7 @@ impl Guardian {
 
     /// The link watches this to notice that the guardian is lost.
     pub(super) fn watch(&self) -> GuardianWatch {
-        GuardianWatch { socket: self.socket.clone(), ear: GuardianEar::new(self.pulse) }
+        GuardianWatch { socket: self.socket.clone(), monitor: GuardianMonitor::new(self.heartbeat) }
     }
 
     /// Ends the guardian. The outputs must be at their shutdown values.
@@ -143,7 +143,7 @@ impl Guardian {
 /// The link's view of the guardian.
 pub(super) struct GuardianWatch {
     socket: Arc<OwnedFd>,
-    ear: GuardianEar,
+    monitor: GuardianMonitor,
 }
 
 impl GuardianWatch {
@@ -154,19 +154,19 @@ impl GuardianWatch {
 
     /// When to call [`GuardianWatch::hangs`] next (CLOCK_MONOTONIC). `None` while no outputs are held.
     pub(super) fn due(&self) -> Option<Duration> {
-        self.ear.due()
+        self.monitor.due()
     }
 
     /// Whether the guardian is stopped or hangs at `now` (CLOCK_MONOTONIC).
     pub(super) fn hangs(&mut self, now: Duration) -> bool {
-        self.ear.is_lost(now)
+        self.monitor.is_lost(now)
     }
 }
 
 /// The board's way to the guardian.
 struct Lifeline {
     socket: Arc<OwnedFd>,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     /// An answer has failed to come. Then nothing is asked any more: a late answer would pass for the answer to the
     /// next message.
     lost: bool,
@@ -194,7 +194,7 @@ impl Lifeline {
         let sent = sendmsg::<()>(socket, &[IoSlice::new(message)], control, MsgFlags::MSG_NOSIGNAL, None);
         sent.map_err(io::Error::from).and_then(|_| answer(&self.socket)).inspect_err(|_| {
             self.lost = true;
-            self.pulse.miss_answer();
+            self.heartbeat.miss_answer();
         })
     }
 }
@@ -246,13 +246,13 @@ mod tests {
     const MS: Duration = Duration::from_millis(1);
 
     /// A core that continues to run, but owes a shutdown value forever.
-    fn stop_and_owe(pulse: Pulse) {
+    fn stop_and_owe(heartbeat: Heartbeat) {
         for beats in 0.. {
             if beats == 10 {
-                pulse.owe("pwmchip7/pwm0", pulse.now());
+                heartbeat.set_pending("pwmchip7/pwm0", heartbeat.now());
             }
             // This is the beat of a stopped MCU, which has a wider limit: a busy computer may delay a beat.
-            pulse.beat(pulse.now(), false);
+            heartbeat.beat(heartbeat.now(), false);
             thread::sleep(10 * MS);
         }
     }
@@ -298,7 +298,7 @@ mod tests {
             setrlimit(Resource::RLIMIT_AS, limit, limit).unwrap();
         }
         let guardian = Guardian::start(&recording).unwrap();
-        let pulse = guardian.pulse();
+        let heartbeat = guardian.heartbeat();
         let mut guard = guardian.guard();
         let file = File::options().read(true).write(script != "readonly").open(path).unwrap();
         let shutdown: [(RawFd, &[u8]); 2] = [(file.as_raw_fd(), b"on?"), (file.as_raw_fd(), b"off")];
@@ -312,11 +312,11 @@ mod tests {
         }
         // This comes before a beat that may be the last.
         println!("\nguardian {}", guardian.pid);
-        pulse.beat(pulse.now(), script == "hang");
+        heartbeat.beat(heartbeat.now(), script == "hang");
         match script.as_str() {
             "abort" => std::process::abort(),
             "goodbye" => guardian.goodbye(),
-            "owe" => stop_and_owe(pulse),
+            "owe" => stop_and_owe(heartbeat),
             _ => loop {
                 thread::sleep(Duration::from_secs(1));
             },

@@ -23,7 +23,7 @@ use pinion_linux::clock::{monotonic, poll_timeout, wait_until};
 use pinion_linux::sys;
 
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
-use crate::core::heartbeat::{Ear, Pulse};
+use crate::core::heartbeat::{Heartbeat, HeartbeatMonitor};
 use crate::process::forked;
 use crate::process::realtime;
 use crate::recorder::Recording;
@@ -221,7 +221,7 @@ enum Incoming {
 pub(super) struct Watcher {
     socket: OwnedFd,
     program: Program,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     recording: Recording,
     held: HeldOutputs,
     /// The files so far of an output whose last file has not come yet.
@@ -229,8 +229,8 @@ pub(super) struct Watcher {
 }
 
 impl Watcher {
-    pub(super) fn new(socket: OwnedFd, program: Program, pulse: Pulse, recording: Recording) -> Watcher {
-        Watcher { socket, program, pulse, recording, held: HeldOutputs::default(), files: Vec::new() }
+    pub(super) fn new(socket: OwnedFd, program: Program, heartbeat: Heartbeat, recording: Recording) -> Watcher {
+        Watcher { socket, program, heartbeat, recording, held: HeldOutputs::default(), files: Vec::new() }
     }
 
     /// Reports to the program that it is ready. It watches until the program says goodbye, dies or hangs. In the last
@@ -238,24 +238,26 @@ impl Watcher {
     pub(super) fn watch(mut self) {
         self.answer(TAKEN);
         // This listens to the core's heartbeat. It exists only while outputs are held.
-        let mut ear: Option<Ear> = None;
-        let mut tape = self.recording.guardian();
+        let mut monitor: Option<HeartbeatMonitor> = None;
+        let mut trace_writer = self.recording.guardian();
         let cause = loop {
-            let pause = match &mut ear {
-                Some(ear) => match ear.listen(self.pulse.now()) {
+            let pause = match &mut monitor {
+                Some(monitor) => match monitor.listen(self.heartbeat.now()) {
                     Some(pause) => Some(pause),
                     None => break Cause::Hangs,
                 },
                 None => None,
             };
-            if let Some(tape) = &mut tape {
-                tape.write(self.pulse.now(), Event::Listened);
+            if let Some(trace_writer) = &mut trace_writer {
+                trace_writer.write(self.heartbeat.now(), Event::Listened);
             }
             let (message, ended) = self.wait(pause);
             if message {
                 match self.take_message() {
-                    Incoming::Message if self.held.is_empty() => ear = None,
-                    Incoming::Message => drop(ear.get_or_insert_with(|| Ear::new(self.pulse, self.pulse.now()))),
+                    Incoming::Message if self.held.is_empty() => monitor = None,
+                    Incoming::Message => {
+                        drop(monitor.get_or_insert_with(|| HeartbeatMonitor::new(self.heartbeat, self.heartbeat.now())))
+                    }
                     Incoming::Goodbye => return,
                     Incoming::Closed => break Cause::Died,
                 }
@@ -266,7 +268,7 @@ impl Watcher {
         let recording = self.recording.clone();
         let end = match cause {
             Cause::Died => End::Died,
-            Cause::Hangs => End::Hung { diagnosis: self.pulse.diagnosis() },
+            Cause::Hangs => End::Hung { diagnosis: self.heartbeat.diagnosis() },
         };
         if !self.held.is_empty() {
             self.rescue(&cause);
@@ -339,15 +341,15 @@ impl Watcher {
 
     /// Drives all outputs, kills the program, and logs which outputs could be driven and which could not.
     fn rescue(self, cause: &Cause) {
-        let Watcher { program, pulse, held: HeldOutputs { mut native, apart }, .. } = self;
+        let Watcher { program, heartbeat, held: HeldOutputs { mut native, apart }, .. } = self;
         // Native lines come first, because writing to them never blocks.
         drive(&mut native);
-        let diagnosis = pulse.diagnosis();
+        let diagnosis = heartbeat.diagnosis();
         let program = Arc::new(program);
         let survivor = (!program.has_ended()).then(|| program.clone());
-        let mut crew = Crew::default();
+        let mut rescue = RescueThreads::default();
         for Group { outputs, .. } in apart {
-            crew.employ(outputs, survivor.clone(), TRY_FOR);
+            rescue.employ(outputs, survivor.clone(), TRY_FOR);
         }
         if let Some(program) = &survivor {
             program.kill();
@@ -356,11 +358,11 @@ impl Watcher {
             drive(&mut native);
         }
         let (driven, failed): (Vec<_>, Vec<_>) = native.into_iter().partition(|output| output.outcome.is_driven());
-        crew.employ(failed, None, TRY_FOR);
+        rescue.employ(failed, None, TRY_FOR);
         // If nobody reads the log, writing to it blocks, and this process would keep the lines in use forever. Then the
         // alarm ends it (SIGALRM).
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
-        let of_crew = crew.wait(TRY_FOR, |outcome| {
+        let of_crew = rescue.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
             error!("guardian: after {seconds} s still not at its shutdown value: {}", outcome.complaint());
         });
@@ -394,7 +396,7 @@ fn summary(outcomes: &[&Outcome]) -> String {
 type Attempt = (usize, io::Result<()>);
 
 /// Threads that each drive a group of outputs. So a driver that hangs delays neither the other groups nor this process.
-struct Crew {
+struct RescueThreads {
     tell: Sender<Attempt>,
     told: Receiver<Attempt>,
     /// Indexed by the outputs' numbers.
@@ -403,14 +405,14 @@ struct Crew {
     left: Vec<Work>,
 }
 
-impl Default for Crew {
-    fn default() -> Crew {
+impl Default for RescueThreads {
+    fn default() -> RescueThreads {
         let (tell, told) = mpsc::channel();
-        Crew { tell, told, outcomes: Vec::new(), left: Vec::new() }
+        RescueThreads { tell, told, outcomes: Vec::new(), left: Vec::new() }
     }
 }
 
-impl Crew {
+impl RescueThreads {
     /// Starts a thread that drives these outputs, and retries those that fail until `try_for` is over. With `survivor`,
     /// the program still lives and may drive them too. Then they are driven at once, and again when it has ended.
     fn employ(&mut self, outputs: Vec<Output>, survivor: Option<Arc<Program>>, try_for: Duration) {
@@ -437,7 +439,7 @@ impl Crew {
     /// Waits until all outputs are driven, or `limit` is over, and returns the outcomes. It calls `complain` once for
     /// each output whose first attempt fails.
     fn wait(self, limit: Duration, mut complain: impl FnMut(&Outcome)) -> Vec<Outcome> {
-        let Crew { tell, told, mut outcomes, left } = self;
+        let RescueThreads { tell, told, mut outcomes, left } = self;
         // Without this sender the channel closes when the last thread is done, and ends the wait.
         drop(tell);
         let mut note = |(number, result): Attempt| {
@@ -464,7 +466,7 @@ fn take<T>(from: &Mutex<Option<T>>) -> Option<T> {
     from.lock().unwrap_or_else(PoisonError::into_inner).take()
 }
 
-/// The work of one thread: see [`Crew::employ`].
+/// The work of one thread: see [`RescueThreads::employ`].
 struct Work {
     drives: Vec<(usize, Drive)>,
     survivor: Option<Arc<Program>>,
@@ -539,10 +541,10 @@ mod tests {
     fn an_output_that_failed_before_is_complained_of_when_it_fails_again() {
         let mut failing = vec![output("gpiochip0 line 5", || Err(Errno::EIO.into()))];
         drive(&mut failing);
-        let mut crew = Crew::default();
-        crew.employ(failing, None, Duration::ZERO);
+        let mut rescue = RescueThreads::default();
+        rescue.employ(failing, None, Duration::ZERO);
         let mut complaints = Vec::new();
-        crew.wait(LONG, |outcome| complaints.push(outcome.complaint()));
+        rescue.wait(LONG, |outcome| complaints.push(outcome.complaint()));
         assert_eq!(complaints, ["gpiochip0 line 5: Input/output error (os error 5)"]);
     }
 
@@ -552,15 +554,15 @@ mod tests {
         let hangs = Mutex::new(hangs);
         let (alive, ended) = mpsc::channel();
         let stuck = output("gpiochip3 line 5", move || hangs.lock().unwrap().recv().map_err(io::Error::other));
-        let mut crew = Crew::default();
+        let mut rescue = RescueThreads::default();
         // A line behind the one that hangs, of the same chip, is lost with it.
-        crew.employ(vec![stuck, output("gpiochip3 line 6", || Ok(()))], None, Duration::ZERO);
-        crew.employ(vec![noted("pwmchip0/pwm0", &alive, Some(Errno::ENODEV))], None, Duration::ZERO);
-        crew.employ(vec![noted("pwmchip0/pwm1", &alive, None)], None, Duration::ZERO);
+        rescue.employ(vec![stuck, output("gpiochip3 line 6", || Ok(()))], None, Duration::ZERO);
+        rescue.employ(vec![noted("pwmchip0/pwm0", &alive, Some(Errno::ENODEV))], None, Duration::ZERO);
+        rescue.employ(vec![noted("pwmchip0/pwm1", &alive, None)], None, Duration::ZERO);
         drop(alive);
         assert!(ended.recv().is_err(), "both of the others are done");
         let mut complaints = Vec::new();
-        let outcomes = crew.wait(Duration::from_millis(1), |outcome| complaints.push(outcome.complaint()));
+        let outcomes = rescue.wait(Duration::from_millis(1), |outcome| complaints.push(outcome.complaint()));
         assert!(outcomes[0].result.is_none() && outcomes[1].result.is_none());
         assert_eq!(error_code(&outcomes[2]), Some(libc::ENODEV));
         assert!(outcomes[3].is_driven());
@@ -582,10 +584,10 @@ mod tests {
             of_others.fetch_add(1, Ordering::SeqCst);
             Ok(())
         });
-        let mut crew = Crew::default();
-        crew.employ(vec![failing, other], None, LONG);
+        let mut rescue = RescueThreads::default();
+        rescue.employ(vec![failing, other], None, LONG);
         let mut complaints = 0;
-        let outcomes = crew.wait(LONG, |outcome| {
+        let outcomes = rescue.wait(LONG, |outcome| {
             assert_eq!(error_code(outcome), Some(libc::EIO));
             complaints += 1;
         });
@@ -595,9 +597,9 @@ mod tests {
 
     #[test]
     fn an_output_that_keeps_failing_is_given_up() {
-        let mut crew = Crew::default();
-        crew.employ(vec![output("pwmchip0/pwm0", || Err(Errno::EIO.into()))], None, Duration::from_millis(1));
-        let outcomes = crew.wait(LONG, |_| ());
+        let mut rescue = RescueThreads::default();
+        rescue.employ(vec![output("pwmchip0/pwm0", || Err(Errno::EIO.into()))], None, Duration::from_millis(1));
+        let outcomes = rescue.wait(LONG, |_| ());
         assert_eq!(error_code(&outcomes[0]), Some(libc::EIO));
     }
 

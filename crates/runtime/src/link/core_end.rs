@@ -12,9 +12,9 @@ use log::log;
 use rtrb::{Producer, PushError};
 
 use pinion_linux::clock::monotonic;
-use pinion_sync::calls::Progress;
+use pinion_sync::progress::Progress;
 
-use crate::core::responses::{Inlet, LinkWake};
+use crate::core::responses::{LinkWake, ResponseReader};
 use crate::core::{Payload, Request};
 use crate::link::ledger::Ledger;
 
@@ -32,7 +32,7 @@ const REQUESTS_KEPT: usize = 8;
 pub(crate) struct CoreEnd {
     pub(crate) requests: Producer<Request>,
     pub(crate) thread: Thread,
-    pub(crate) inlet: Inlet,
+    pub(crate) reader: ResponseReader,
     pub(crate) progress: Arc<Progress>,
     pub(crate) wake: Arc<LinkWake>,
     pub(crate) ledger: Ledger,
@@ -109,7 +109,7 @@ impl CoreEnd {
         let (mut tells, mut until) = (false, start + AWAIT_CORE);
         while done != handed {
             let (now, done_now) = (monotonic(), self.progress.done());
-            let progresses = done_now != done || !tells && self.inlet.has_response();
+            let progresses = done_now != done || !tells && self.reader.has_response();
             done = done_now;
             if progresses {
                 tells = true;
@@ -124,12 +124,12 @@ impl CoreEnd {
 
     /// Whether there is news for the host: responses or acknowledgements.
     pub(crate) fn has_news(&self) -> bool {
-        self.inlet.has_response() || self.ledger.is_behind(self.progress.done())
+        self.reader.has_response() || self.ledger.is_behind(self.progress.done())
     }
 
     /// Logs the core's lines.
     pub(crate) fn log_lines(&mut self) {
-        while let Some((level, line, kind)) = self.inlet.line() {
+        while let Some((level, line, kind)) = self.reader.line() {
             log!(target: line.get(..kind).unwrap_or_default(), level, "{line}");
         }
     }
@@ -138,17 +138,17 @@ impl CoreEnd {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::core::responses::outlet;
+    use crate::core::responses::response_ring;
     use pinion_firmware::mcu::Outbox as _;
     use rtrb::RingBuffer;
 
     #[test]
     fn a_response_is_news_and_so_is_a_finished_block() {
         let (wake, progress) = (Arc::new(LinkWake::new().unwrap()), Arc::new(Progress::default()));
-        let (mut outlet, inlet) = outlet(wake.clone(), progress.clone());
+        let (mut response_ring, reader) = response_ring(wake.clone(), progress.clone());
         let (requests, _inbox) = RingBuffer::new(16);
         let (thread, ledger) = (thread::current(), Ledger::default());
-        let mut end = CoreEnd { requests, thread, inlet, progress: progress.clone(), wake, ledger, may_poll: false };
+        let mut end = CoreEnd { requests, thread, reader, progress: progress.clone(), wake, ledger, may_poll: false };
         assert!(!end.has_news());
         end.hand(Payload::new(b""), false);
         progress.begin();
@@ -158,7 +158,7 @@ mod tests {
         let done = progress.done();
         end.ledger.acknowledge(done);
         assert!(!end.has_news());
-        outlet.send(b"response");
+        response_ring.send(b"response");
         assert!(end.has_news());
     }
 }

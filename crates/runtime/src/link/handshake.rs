@@ -20,7 +20,7 @@ use crate::FIRMWARE;
 use crate::core::responses::LinkWake;
 use crate::host::search::{HostFinder, HostSearch};
 use crate::link::survey::{self, Surveyor};
-use crate::status::HostBoard;
+use crate::status::HostStatus;
 use crate::trouble::started;
 
 /// How long the host's first bytes wait. After that the host gets the union dialect. Shortly after the computer's
@@ -29,7 +29,7 @@ use crate::trouble::started;
 const FIND_LIMIT: Duration = Duration::from_secs(3);
 
 /// Finds the facts about a host.
-pub(crate) struct Introduction {
+pub(crate) struct Handshake {
     /// The dialects that a host may speak. The first one is spoken before a host comes.
     dialects: Vec<Arc<Dialect>>,
     /// The dialects before the last change of the board. They stay until the next change, so that the core never frees
@@ -45,7 +45,7 @@ pub(crate) struct Introduction {
     is_overdue: bool,
 }
 
-/// The state of an introduction.
+/// The state of an handshake.
 pub(crate) enum Step {
     /// The host's bytes have to wait.
     Wait,
@@ -55,7 +55,7 @@ pub(crate) enum Step {
     Done,
 }
 
-impl Introduction {
+impl Handshake {
     /// Starts the threads that search. Call it before the link gets real-time priority, or they inherit it. `only` is
     /// the one dialect that is spoken, or `None`. `wire` is the host's wire, and `terminal` is what it has open.
     pub(crate) fn start(
@@ -64,8 +64,8 @@ impl Introduction {
         search: Option<HostSearch>,
         (wire, terminal): (Wire, Option<&Path>),
         wake: &Arc<LinkWake>,
-        shown: &Arc<HostBoard>,
-    ) -> Result<Introduction, Trouble> {
+        shown: &Arc<HostStatus>,
+    ) -> Result<Handshake, Trouble> {
         let names = match only {
             Some(name) => vec![name],
             None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
@@ -77,14 +77,14 @@ impl Introduction {
         let finder = finder.map(started).transpose()?;
         let surveyor =
             board.view().map(|view| started(Surveyor::start(firmware, view, names, wake.clone()))).transpose()?;
-        Ok(Introduction { dialects, outdated: Vec::new(), finder, surveyor, until: None, is_overdue: false })
+        Ok(Handshake { dialects, outdated: Vec::new(), finder, surveyor, until: None, is_overdue: false })
     }
 
     /// Every host speaks this dialect, and the board never changes.
     #[cfg(fuzzing)]
-    pub(crate) fn of(dialect: Arc<Dialect>) -> Introduction {
+    pub(crate) fn of(dialect: Arc<Dialect>) -> Handshake {
         let dialects = vec![dialect];
-        Introduction { dialects, outdated: Vec::new(), finder: None, surveyor: None, until: None, is_overdue: false }
+        Handshake { dialects, outdated: Vec::new(), finder: None, surveyor: None, until: None, is_overdue: false }
     }
 
     /// The dialect that is spoken before a host comes.

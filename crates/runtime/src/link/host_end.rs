@@ -17,7 +17,7 @@ use pinion_linux::clock::monotonic;
 use pinion_protocol::block::{Received, Receiver, Refusal, SYNC, Sequence, frame};
 
 use crate::core::Payload;
-use crate::status::HostBoard;
+use crate::status::HostStatus;
 use crate::transport::{Heard, Link, serving};
 
 /// The text that a shell writes to a pty to stop the MCU, as in Klipper's service file.
@@ -43,7 +43,7 @@ pub(crate) struct HostEnd {
     /// How long a host that is there may be silent.
     silence_max: Option<Duration>,
     /// Shows whether a host is there.
-    shown: Arc<HostBoard>,
+    shown: Arc<HostStatus>,
 }
 
 /// The result of a read.
@@ -73,7 +73,7 @@ pub(crate) enum Next {
 
 impl HostEnd {
     /// The end of a link without a host.
-    pub(crate) fn new(link: Box<dyn Link>, shown: Arc<HostBoard>) -> HostEnd {
+    pub(crate) fn new(link: Box<dyn Link>, shown: Arc<HostStatus>) -> HostEnd {
         HostEnd {
             silence_max: link.silence_max(),
             link,

@@ -22,7 +22,7 @@ use pinion_protocol::vlq::{Reader, Writer};
 
 use crate::core::{Payload, Request};
 use crate::link::core_end::{CoreEnd, STALL};
-use crate::link::handshake::{Introduction, Step};
+use crate::link::handshake::{Handshake, Step};
 use crate::link::host_end::{HostEnd, Next};
 use crate::link::ledger::is_after;
 use crate::link::oversight::{FAREWELL, Oversight};
@@ -87,7 +87,7 @@ impl Known {
 pub(crate) struct LinkThread {
     host: HostEnd,
     core: CoreEnd,
-    introduction: Introduction,
+    handshake: Handshake,
     oversight: Oversight,
     clock: Arc<dyn TimeSource>,
     known: Known,
@@ -95,7 +95,7 @@ pub(crate) struct LinkThread {
     /// next block. Earlier responses may be in the dialect of the previous host.
     changed_at: Option<u32>,
     recorder: Recorder,
-    tape: Option<ring::Writer>,
+    trace_writer: Option<ring::Writer>,
 }
 
 /// What ended the link's sleep. The link looks only there, because each look is a system call.
@@ -122,15 +122,15 @@ impl LinkThread {
     pub(crate) fn new(
         host: HostEnd,
         core: CoreEnd,
-        introduction: Introduction,
+        handshake: Handshake,
         oversight: Oversight,
         clock: Arc<dyn TimeSource>,
         recorder: Recorder,
     ) -> LinkThread {
-        let known = Known::new(introduction.first_dialect());
+        let known = Known::new(handshake.first_dialect());
         recorder.speak(&known.dialect);
-        let tape = recorder.link();
-        LinkThread { host, core, introduction, oversight, clock, known, changed_at: None, recorder, tape }
+        let trace_writer = recorder.link();
+        LinkThread { host, core, handshake, oversight, clock, known, changed_at: None, recorder, trace_writer }
     }
 
     /// Feeds a hardware watchdog from now on.
@@ -184,7 +184,7 @@ impl LinkThread {
         let end = monotonic() + FAREWELL;
         while self.host.is_attached() && monotonic() < end {
             // Bytes without room in the terminal go out as the host reads.
-            let is_out = self.host.is_out() && !self.core.inlet.has_response();
+            let is_out = self.host.is_out() && !self.core.reader.has_response();
             let events = if is_out { PollFlags::empty() } else { PollFlags::POLLOUT };
             let Some(event) = self.host.event() else { return };
             let mut fds = [PollFd::new(event, events)];
@@ -200,8 +200,8 @@ impl LinkThread {
 
     /// Closes the link, then stops the watchdogs.
     pub(crate) fn close(self) {
-        let LinkThread { host, core, introduction, oversight, recorder, .. } = self;
-        drop((host, core, introduction, recorder));
+        let LinkThread { host, core, handshake, oversight, recorder, .. } = self;
+        drop((host, core, handshake, recorder));
         oversight.end();
     }
 
@@ -222,7 +222,7 @@ impl LinkThread {
     /// Sleeps until there is something to do. `now` may be a little in the past: a look at the clock is not free.
     fn wait(&mut self, stalled: bool, now: Duration) -> io::Result<Woken> {
         self.core.wake.sleeping();
-        if self.core.has_news() && !self.host.is_full() || self.core.inlet.has_line() {
+        if self.core.has_news() && !self.host.is_full() || self.core.reader.has_line() {
             self.core.wake.awake(false);
             return Ok(Woken { by_oversight: false, by_input: true, by_hangup: false });
         }
@@ -277,7 +277,7 @@ impl LinkThread {
         let was_open = self.host.is_open();
         let read = self.host.read(hung_up)?;
         if read.is_gone {
-            self.introduction.end();
+            self.handshake.end();
             self.record(Event::HostGone);
         }
         if let Some(stop) = self.host.intrusion() {
@@ -287,7 +287,7 @@ impl LinkThread {
             self.tell_status();
         }
         if read.is_new_host {
-            self.introduction.begin(self.host.terminal());
+            self.handshake.begin(self.host.terminal());
             self.record(Event::HostCame);
         }
         if read.is_sign {
@@ -303,7 +303,7 @@ impl LinkThread {
     /// Whether the link still has to find out the host's dialect, or what the board has.
     fn is_finding(&mut self) -> bool {
         loop {
-            match self.introduction.step(self.known.dialect.name()) {
+            match self.handshake.step(self.known.dialect.name()) {
                 Step::Wait => return true,
                 Step::Speak(dialect) => self.speak(dialect),
                 Step::Done => return false,
@@ -380,7 +380,7 @@ impl LinkThread {
     /// Frames the core's responses, as long as the host reads.
     fn frame_responses(&mut self) {
         while !self.host.is_full() {
-            let Some((payload, core_begun)) = self.core.inlet.response() else { return };
+            let Some((payload, core_begun)) = self.core.reader.response() else { return };
             self.changed_at = self.changed_at.filter(|changed_at| !is_after(core_begun, *changed_at));
             if self.changed_at.is_some() && !self.known.dialect.is_own_response(payload) {
                 continue;
@@ -416,8 +416,8 @@ impl LinkThread {
     }
 
     fn record_at(&mut self, at: Clock, event: Event) {
-        if let Some(tape) = &mut self.tape {
-            tape.write(at, event);
+        if let Some(trace_writer) = &mut self.trace_writer {
+            trace_writer.write(at, event);
         }
     }
 }

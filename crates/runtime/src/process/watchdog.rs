@@ -20,7 +20,7 @@ use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
-use crate::core::heartbeat::{BEAT, Pulse};
+use crate::core::heartbeat::{BEAT, Heartbeat};
 use crate::process::notify::Notify;
 
 /// Longest time that one job of a worker may take.
@@ -89,16 +89,16 @@ pub(crate) struct Vigil {
     /// How often the watchdogs are fed. `None` if there are none.
     interval: Option<Duration>,
     due: Duration,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     starving: bool,
 }
 
 impl Vigil {
     /// `notify_interval` is how often the service manager wants to be fed, if at all.
-    pub(crate) fn new(notify: Notify, notify_interval: Option<Duration>, pulse: Pulse) -> Vigil {
+    pub(crate) fn new(notify: Notify, notify_interval: Option<Duration>, heartbeat: Heartbeat) -> Vigil {
         // Between two heartbeats of the core nothing new is known. So feeding more often is of no use.
         let interval = notify_interval.map(|interval| interval.max(BEAT));
-        Vigil { watchdog: None, notify, interval, due: monotonic(), pulse, starving: false }
+        Vigil { watchdog: None, notify, interval, due: monotonic(), heartbeat, starving: false }
     }
 
     /// Feeds a hardware watchdog as well.
@@ -117,9 +117,9 @@ impl Vigil {
     pub(crate) fn tick(&mut self, now: Duration) {
         let Some(interval) = self.interval.filter(|_| now >= self.due) else { return };
         self.due = now + interval;
-        let clock = self.pulse.at(now);
-        let silent = self.pulse.is_silent(clock);
-        let stuck = self.pulse.stuck(clock, JOB_LIMIT);
+        let clock = self.heartbeat.at(now);
+        let silent = self.heartbeat.is_silent(clock);
+        let stuck = self.heartbeat.stuck(clock, JOB_LIMIT);
         if !silent && stuck.is_none() {
             if std::mem::take(&mut self.starving) {
                 warn!("Pinion hangs no longer: the watchdogs are fed again");
@@ -170,13 +170,13 @@ mod tests {
     use pinion_linux::clock::Monotonic;
     use std::fs;
 
-    fn vigil(path: &Path) -> (Vigil, Pulse) {
-        let pulse = Pulse::new(Monotonic::start()).unwrap();
+    fn vigil(path: &Path) -> (Vigil, Heartbeat) {
+        let heartbeat = Heartbeat::new(Monotonic::start()).unwrap();
         let watchdog = Watchdog::open(path).unwrap();
         let notify = Notify::from_env().unwrap();
-        let mut vigil = Vigil::new(notify, None, pulse);
+        let mut vigil = Vigil::new(notify, None, heartbeat);
         vigil.feed(watchdog);
-        (vigil, pulse)
+        (vigil, heartbeat)
     }
 
     fn food(path: &Path) -> String {
@@ -186,12 +186,12 @@ mod tests {
     #[test]
     fn fed_while_the_core_beats_and_stopped_at_an_orderly_end() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let (mut vigil, pulse) = vigil(file.path());
+        let (mut vigil, heartbeat) = vigil(file.path());
         let interval = vigil.interval.unwrap();
         assert_eq!(interval, USUAL_LIMIT / 3);
         let mut now = vigil.due().unwrap();
         for _ in 0..3 {
-            pulse.beat(pulse.at(now), true);
+            heartbeat.beat(heartbeat.at(now), true);
             vigil.tick(now);
             vigil.tick(now + interval / 2);
             now += interval;
@@ -200,7 +200,7 @@ mod tests {
         // The core has not given a heartbeat since the watchdog was last fed.
         vigil.tick(now);
         assert_eq!(food(file.path()), "...");
-        pulse.beat(pulse.at(now + interval), true);
+        heartbeat.beat(heartbeat.at(now + interval), true);
         vigil.tick(now + interval);
         vigil.end();
         assert_eq!(food(file.path()), "....V");
@@ -209,14 +209,14 @@ mod tests {
     #[test]
     fn not_fed_while_a_job_takes_too_long_and_not_stopped_by_a_crash() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let (mut vigil, pulse) = vigil(file.path());
-        let clock = pulse.worker("spi0").unwrap();
+        let (mut vigil, heartbeat) = vigil(file.path());
+        let clock = heartbeat.worker("spi0").unwrap();
         let interval = vigil.interval.unwrap();
         clock.begin();
         let start = vigil.due().unwrap();
         let mut tick = |n| {
             let now = start + n * interval;
-            pulse.beat(pulse.at(now), true);
+            heartbeat.beat(heartbeat.at(now), true);
             vigil.tick(now);
         };
         (0..5).for_each(&mut tick);
@@ -232,9 +232,9 @@ mod tests {
     #[test]
     fn a_core_that_is_configured_may_take_its_time() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let (mut vigil, pulse) = vigil(file.path());
+        let (mut vigil, heartbeat) = vigil(file.path());
         let (start, interval) = (vigil.due().unwrap(), vigil.interval.unwrap());
-        pulse.beat(pulse.at(start + Duration::from_millis(10)), false);
+        heartbeat.beat(heartbeat.at(start + Duration::from_millis(10)), false);
         for tick in 0..12 {
             vigil.tick(start + tick * interval);
         }

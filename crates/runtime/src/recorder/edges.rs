@@ -24,7 +24,7 @@ use super::locked;
 /// from the board itself.
 pub(super) struct EdgeBoard {
     pub(super) board: Box<dyn Board>,
-    pub(super) tape: Arc<EdgeTape>,
+    pub(super) trace_writer: Arc<EdgeTape>,
     /// Where the names of the lines are noted.
     pub(super) names: Arc<Mutex<Names>>,
 }
@@ -50,7 +50,7 @@ const UNKNOWN: u8 = 2;
 /// A line that records its edges.
 struct EdgeLine {
     line: Arc<dyn Line>,
-    tape: Arc<EdgeTape>,
+    trace_writer: Arc<EdgeTape>,
     pin: u32,
     level: AtomicU8,
 }
@@ -58,7 +58,7 @@ struct EdgeLine {
 impl EdgeLine {
     fn is_now(&self, level: bool) {
         if self.level.swap(level.into(), Ordering::Relaxed) != u8::from(level) {
-            self.tape.record(self.pin, level);
+            self.trace_writer.record(self.pin, level);
         }
     }
 }
@@ -114,7 +114,7 @@ impl EdgeBoard {
     fn recorded(&self, pin: Pin, line: Arc<dyn Line>) -> Arc<EdgeLine> {
         let name = pin.name_in(&self.board.pins());
         locked(&self.names).pins.insert(pin.0, name);
-        Arc::new(EdgeLine { line, tape: self.tape.clone(), pin: pin.0, level: AtomicU8::new(UNKNOWN) })
+        Arc::new(EdgeLine { line, trace_writer: self.trace_writer.clone(), pin: pin.0, level: AtomicU8::new(UNKNOWN) })
     }
 }
 
@@ -196,8 +196,8 @@ mod tests {
     use pinion_testbench::rig::{Rig, hex};
 
     fn edge_board(recording: &Recording, bench: Bench, names: &Arc<Mutex<Names>>) -> EdgeBoard {
-        let tape = EdgeTape { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
-        EdgeBoard { board: Box::new(FakeBoard(bench)), tape: Arc::new(tape), names: names.clone() }
+        let trace_writer = EdgeTape { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
+        EdgeBoard { board: Box::new(FakeBoard(bench)), trace_writer: Arc::new(trace_writer), names: names.clone() }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use log::debug;
 
 use pinion_linux::sys;
 use pinion_sync::ring::{self, Ring};
-use pinion_sync::together::{self, Together};
+use pinion_sync::seqlock::{self, Seqlock};
 
 use pinion_trace::event::Watched;
 use pinion_trace::file::Names;
@@ -47,7 +47,7 @@ const NAMES_BYTES: usize = 1 << 16;
 /// Words of the names: their length in bytes, and the bytes.
 const NAMES_WORDS: usize = 1 + NAMES_BYTES / 8;
 /// Words before the rings. A program that is killed while it stores new names leaves the present ones.
-const HEAD_WORDS: usize = together::words(NAMES_WORDS);
+const HEAD_WORDS: usize = seqlock::words(NAMES_WORDS);
 /// Words of a page. A store to one of them makes the kernel provide the page.
 const PAGE_WORDS: usize = 4096 / 8;
 
@@ -144,8 +144,8 @@ impl Memory {
         self.kept_names().store(iter::once(json.len() as u64).chain(words));
     }
 
-    fn kept_names(self) -> Together {
-        Together::new(&self.0[..HEAD_WORDS])
+    fn kept_names(self) -> Seqlock {
+        Seqlock::new(&self.0[..HEAD_WORDS])
     }
 
     pub(super) fn names(self) -> Names {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The flight recorder. Each thread writes 16-byte events into a ring of its own (`memory.rs`, `tape.rs`). A thread of
+//! The flight recorder. Each thread writes 16-byte events into a ring of its own (`memory.rs`, `trace_writer.rs`). A thread of
 //! low priority reads the kernel's accounts some times a second (`computer.rs`). At each stop of the MCU it keeps the
 //! rings in a file, and logs who was late. If the program dies or hangs, the guardian does that.
 
@@ -9,7 +9,7 @@ mod computer;
 mod edges;
 mod memory;
 mod pace;
-mod tape;
+mod trace_writer;
 
 use std::collections::BTreeMap;
 use std::fs::{self, Permissions};
@@ -46,21 +46,21 @@ use pinion_trace::folder;
 use pinion_trace::ring::Writer;
 use pinion_trace::verdict::{Culprit, Verdict, verdict};
 
-use crate::status::{Manners, Place, serve_on};
+use crate::status::{ClientLimits, Place, serve_on};
 use crate::transport::LinkName;
 
 use computer::Computer;
 use edges::{EdgeBoard, EdgeTape};
 use memory::Memory;
 use pace::Pace;
-use tape::News;
-pub use tape::Sleep;
-pub(super) use tape::Tape;
+use trace_writer::News;
+pub use trace_writer::Sleep;
+pub(super) use trace_writer::TraceWriter;
 
 /// How long the recorder waits after a stop, so that the events of all threads are there.
 const SETTLE: Duration = Duration::from_millis(20);
 /// Each answer to clients copies all rings, so there are few.
-const CLIENTS: Manners = Manners { pause: Duration::from_millis(500), limit: Duration::from_secs(30) };
+const CLIENTS: ClientLimits = ClientLimits { pause: Duration::from_millis(500), limit: Duration::from_secs(30) };
 /// A host that stops the MCU again and again must not keep the disk busy.
 const RECORDINGS: Pace = Pace::new(5, Duration::from_secs(60));
 /// The same for stops that the host asked for. Only the last of them stays.
@@ -269,14 +269,17 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// A recorder whose thread has not started, and the core's tape.
-    pub(super) fn new(recording: Recording) -> io::Result<(Recorder, Tape)> {
+    /// A recorder whose thread has not started, and the core's trace_writer.
+    pub(super) fn new(recording: Recording) -> io::Result<(Recorder, TraceWriter)> {
         let wake = Arc::new(EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?);
         let (producer, news) = RingBuffer::new(NEWS);
         let writers = recording.memory.core().ok_or_else(|| io::Error::other("the recording has another core"))?;
         recording.memory.touch();
-        let tape = Tape::new(writers, producer, wake.clone());
-        Ok((Recorder { recording, names: Arc::default(), wake, news: Some(news), thread: None, clients: None }, tape))
+        let trace_writer = TraceWriter::new(writers, producer, wake.clone());
+        Ok((
+            Recorder { recording, names: Arc::default(), wake, news: Some(news), thread: None, clients: None },
+            trace_writer,
+        ))
     }
 
     /// Names the commands of the host's dialect.
@@ -295,8 +298,8 @@ impl Recorder {
     /// The same board, which also records the edges of its outputs.
     pub(super) fn with_edges(&self, board: Box<dyn Board>) -> Box<dyn Board> {
         let Some(writer) = self.recording.memory.edges() else { return board };
-        let tape = Arc::new(EdgeTape { writer: Mutex::new(writer), clock: self.recording.clock });
-        Box::new(EdgeBoard { board, tape, names: self.names.clone() })
+        let trace_writer = Arc::new(EdgeTape { writer: Mutex::new(writer), clock: self.recording.clock });
+        Box::new(EdgeBoard { board, trace_writer, names: self.names.clone() })
     }
 
     /// The link's writer.

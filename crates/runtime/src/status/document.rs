@@ -15,11 +15,11 @@ use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::mcu::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Snapshot};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};
 
-use super::{Answer, Asker};
+use super::{Answer, SnapshotReader};
 
 /// Facts about the host, as the threads that find them leave them.
 #[derive(Default)]
-pub(crate) struct HostBoard {
+pub(crate) struct HostStatus {
     /// Whether a host has the terminal open. The link says so.
     attached: AtomicBool,
     /// The terminal, or more about the link's place.
@@ -40,7 +40,7 @@ pub(crate) struct FoundHost {
     pub(crate) commit: Option<String>,
 }
 
-impl HostBoard {
+impl HostStatus {
     pub(crate) fn attach(&self, attached: bool) {
         self.attached.store(attached, Ordering::Relaxed);
     }
@@ -95,20 +95,20 @@ pub(crate) struct Facts {
 
 /// Writes the status.
 pub(super) struct Reporter {
-    asker: Asker,
+    snapshot_reader: SnapshotReader,
     facts: Facts,
-    host: Arc<HostBoard>,
+    host: Arc<HostStatus>,
     started: Instant,
 }
 
 impl Reporter {
-    pub(super) fn new(asker: Asker, facts: Facts, host: Arc<HostBoard>) -> Reporter {
-        Reporter { asker, facts, host, started: Instant::now() }
+    pub(super) fn new(snapshot_reader: SnapshotReader, facts: Facts, host: Arc<HostStatus>) -> Reporter {
+        Reporter { snapshot_reader, facts, host, started: Instant::now() }
     }
 
     /// The status now. It asks the core, and waits for the answer.
     pub(super) fn status(&mut self) -> Status {
-        let answer = self.asker.ask();
+        let answer = self.snapshot_reader.ask();
         let facts = &mut self.facts;
         if let Some(view) = &facts.view {
             (facts.board, facts.pins) = (view.describe(), view.pins());

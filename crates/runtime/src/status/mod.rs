@@ -21,9 +21,9 @@ mod document;
 pub mod form;
 mod socket;
 
-pub(super) use document::{Facts, FoundHost, HostBoard};
+pub(super) use document::{Facts, FoundHost, HostStatus};
 pub use socket::connect;
-pub(super) use socket::{Manners, Place, StatusSocket, open as open_socket, serve_on};
+pub(super) use socket::{ClientLimits, Place, StatusSocket, open as open_socket, serve_on};
 pub use socket::{socket_paths, trace_socket_paths};
 
 /// Longest wait for the core's answer. It is longer than the core's longest nap.
@@ -42,7 +42,7 @@ struct Answer {
 }
 
 /// The core's end.
-pub(super) struct Teller {
+pub(super) struct SnapshotWriter {
     asked: Consumer<Box<Answer>>,
     told: Producer<Box<Answer>>,
     /// The answer that is being filled in.
@@ -50,7 +50,7 @@ pub(super) struct Teller {
 }
 
 /// The status thread's end.
-pub(super) struct Asker {
+pub(super) struct SnapshotReader {
     ask: Producer<Box<Answer>>,
     answers: Consumer<Box<Answer>>,
     /// The answer while the core does not have it.
@@ -58,13 +58,13 @@ pub(super) struct Asker {
 }
 
 /// Makes both ends.
-pub(super) fn ends() -> (Teller, Asker) {
+pub(super) fn ends() -> (SnapshotWriter, SnapshotReader) {
     let (ask, asked) = RingBuffer::new(1);
     let (told, answers) = RingBuffer::new(1);
-    (Teller { asked, told, at_work: None }, Asker { ask, answers, spare: Some(Box::default()) })
+    (SnapshotWriter { asked, told, at_work: None }, SnapshotReader { ask, answers, spare: Some(Box::default()) })
 }
 
-impl Teller {
+impl SnapshotWriter {
     /// Whether somebody waits for an answer.
     #[inline]
     pub(super) fn is_asked(&self) -> bool {
@@ -86,7 +86,7 @@ impl Teller {
     }
 }
 
-impl Asker {
+impl SnapshotReader {
     /// Asks the core, and waits for the answer. `None` if it does not come in time.
     fn ask(&mut self) -> Option<&Answer> {
         let until = Instant::now() + ANSWER_WAIT_MAX;

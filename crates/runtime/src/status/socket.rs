@@ -26,11 +26,11 @@ use pinion_linux::foreign::plain_json;
 use pinion_linux::own_folder::{OwnFolder, below};
 use pinion_trace::folder::name_of;
 
-use super::Asker;
-use super::document::{Facts, HostBoard, Reporter};
+use super::SnapshotReader;
+use super::document::{Facts, HostStatus, Reporter};
 
 /// Shortest time between two questions to the core, however many clients ask, and how long a client may take to read.
-const MANNERS: Manners = Manners { pause: Duration::from_millis(50), limit: Duration::from_secs(5) };
+const MANNERS: ClientLimits = ClientLimits { pause: Duration::from_millis(50), limit: Duration::from_secs(5) };
 /// Highest number of clients that get one answer. Others wait in the kernel's queue.
 const CLIENTS_MAX: usize = 32;
 /// Highest number of answers that are being read. Another one drops the oldest, and its clients.
@@ -38,7 +38,7 @@ const ANSWERS_MAX: usize = 4;
 
 /// How a socket treats its clients.
 #[derive(Clone, Copy)]
-pub(crate) struct Manners {
+pub(crate) struct ClientLimits {
     /// Shortest time between two answers.
     pub(crate) pause: Duration,
     /// How long a client may take to read its answer.
@@ -66,12 +66,12 @@ impl StatusSocket {
         paths: &[PathBuf],
         terminal: Option<&Path>,
         facts: Facts,
-        host: Arc<HostBoard>,
-        asker: Asker,
+        host: Arc<HostStatus>,
+        snapshot_reader: SnapshotReader,
     ) -> Option<StatusSocket> {
         let (listener, place) = open(paths, terminal, |errors| warn!("pinion status will not be answered: {errors}"))?;
         info!("status on {}", place.path.display());
-        let mut reporter = Reporter::new(asker, facts, host);
+        let mut reporter = Reporter::new(snapshot_reader, facts, host);
         let served = serve_on(listener, "status", MANNERS, move || match serde_json::to_string(&reporter.status()) {
             Ok(document) => Some(plain_json(&document).into_bytes()),
             Err(error) => {
@@ -199,7 +199,7 @@ pub fn connect(path: &Path) -> io::Result<UnixStream> {
 pub(crate) fn serve_on(
     listener: UnixListener,
     thread: &str,
-    manners: Manners,
+    manners: ClientLimits,
     answer: impl FnMut() -> Option<Vec<u8>> + Send + 'static,
 ) -> io::Result<PipeWriter> {
     let (end, alive) = io::pipe()?;
@@ -231,7 +231,12 @@ impl Answer {
 }
 
 /// A client that does not read keeps neither this thread nor another client. It gets as much as there is room for.
-fn serve(listener: &UnixListener, end: &PipeReader, manners: Manners, mut answer: impl FnMut() -> Option<Vec<u8>>) {
+fn serve(
+    listener: &UnixListener,
+    end: &PipeReader,
+    manners: ClientLimits,
+    mut answer: impl FnMut() -> Option<Vec<u8>>,
+) {
     // The oldest one is the first.
     let mut answers: VecDeque<Answer> = VecDeque::new();
     let mut next = Duration::ZERO;
@@ -305,15 +310,16 @@ mod tests {
     fn a_core_that_does_not_answer_keeps_nobody() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mcu.sock");
-        let (teller, asker) = ends();
-        let socket = StatusSocket::start(std::slice::from_ref(&path), None, facts(), Arc::default(), asker).unwrap();
+        let (snapshots, snapshot_reader) = ends();
+        let socket =
+            StatusSocket::start(std::slice::from_ref(&path), None, facts(), Arc::default(), snapshot_reader).unwrap();
         for _ in 0..2 {
             let mut text = String::new();
             UnixStream::connect(&path).unwrap().read_to_string(&mut text).unwrap();
             let (status, _) = form::read(text.as_bytes()).unwrap();
             assert_eq!((status.state, status.board.as_str(), status.mcu), (State::Unknown, "a board", None));
         }
-        assert!(teller.is_asked());
+        assert!(snapshots.is_asked());
         drop(socket);
         assert!(!path.exists());
     }
@@ -346,7 +352,7 @@ mod tests {
         let path = folder.path().join("s");
         let listener = UnixListener::bind(&path).unwrap();
         listener.set_nonblocking(true).unwrap();
-        let manners = Manners { pause: Duration::from_millis(1), limit };
+        let manners = ClientLimits { pause: Duration::from_millis(1), limit };
         let thread = serve_on(listener, "test", manners, move || Some(vec![7; bytes])).unwrap();
         // A client that is in the kernel's queue is not being served yet: its first byte tells.
         let client = move || {

@@ -9,8 +9,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 
+use super::seqlock::Seqlock;
 use super::time::seconds;
-use super::together::Together;
 use super::track::Track;
 use crate::description::axes::{AxisConfig, End};
 use crate::description::heater::{FanConfig, HeaterConfig};
@@ -82,7 +82,7 @@ pub struct Axis {
     lost_steps: AtomicU64,
     /// The instant of the last step, the ticks between it and the step before, and the number of lost steps in a row
     /// until then.
-    stride: Together<3>,
+    stride: Seqlock<3>,
 }
 
 /// The position of a motor at its start. The limits of the description keep it below 2^63.
@@ -138,7 +138,7 @@ impl Axis {
             position,
             turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
-            stride: Together::new([0, u64::MAX, 0]),
+            stride: Seqlock::new([0, u64::MAX, 0]),
         }
     }
 
@@ -272,7 +272,7 @@ pub struct Heater {
     sensor_lag_s: f64,
     /// The time of the last change, the temperatures of the mass and the sensor then, whether power is on, and whether
     /// the fan blows.
-    state: Together<5>,
+    state: Seqlock<5>,
 }
 
 /// A heater at one instant.
@@ -301,7 +301,7 @@ impl Heater {
             loss_w_per_k: config.loss_w_per_k,
             cooling_w_per_k,
             sensor_lag_s: config.sensor_lag_s,
-            state: Together::new([now.ticks(), start, start, always_on.into(), 0]),
+            state: Seqlock::new([now.ticks(), start, start, always_on.into(), 0]),
         }
     }
 
@@ -358,7 +358,7 @@ pub struct Fan {
     /// The heater that it cools.
     cools: Option<Arc<Heater>>,
     /// The time of the last change, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
-    state: Together<4>,
+    state: Seqlock<4>,
 }
 
 /// All of these must be on for a fan to have power.
@@ -385,7 +385,7 @@ impl Fan {
             spin_up_s: config.spin_up_s,
             pulses_per_revolution: config.pulses_per_revolution.into(),
             cools,
-            state: Together::new([now.ticks(), standstill, standstill, always_enabled]),
+            state: Seqlock::new([now.ticks(), standstill, standstill, always_enabled]),
         }
     }
 
@@ -434,7 +434,7 @@ impl Fan {
 pub struct Lamp {
     pub name: String,
     /// The time of the last change, whether it is on, when it was last switched on, and its share of time on.
-    state: Together<4>,
+    state: Seqlock<4>,
 }
 
 impl Lamp {
@@ -443,7 +443,7 @@ impl Lamp {
     const STEADY_S: f64 = 0.15;
 
     pub fn new(name: &str) -> Lamp {
-        Lamp { name: name.to_owned(), state: Together::new([0; 4]) }
+        Lamp { name: name.to_owned(), state: Seqlock::new([0; 4]) }
     }
 
     pub fn is_on(&self) -> bool {

@@ -24,8 +24,8 @@ use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
 use crate::engine::look::Look;
+use crate::engine::seqlock::Seqlock;
 use crate::engine::time::seconds;
-use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
@@ -197,7 +197,7 @@ struct Bltouch {
     tip: [f64; 3],
     move_s: f64,
     jams: Option<Jam>,
-    state: Together<5>,
+    state: Seqlock<5>,
 }
 
 impl Bltouch {
@@ -218,7 +218,7 @@ impl Bltouch {
             tip: [config.x_offset_mm, config.y_offset_mm, -config.z_offset_mm],
             move_s: config.move_s,
             jams: config.jams,
-            state: Together::new(state.words()),
+            state: Seqlock::new(state.words()),
         }
     }
 

@@ -24,9 +24,9 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::engine::seqlock::Seqlock;
 use crate::engine::spi::{MISO, SpiChip};
 use crate::engine::time::seconds;
-use crate::engine::together::Together;
 use crate::engine::wire::{ControllerPin, Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -196,14 +196,14 @@ struct Hx71x {
     chip: Hx71xChip,
     samples_per_s: f64,
     cell: Cell,
-    state: Together<5>,
+    state: Seqlock<5>,
 }
 
 impl Hx71x {
     fn new(chip: Hx71xChip, samples_per_s: u32, cell: Cell) -> Hx71x {
         let start = Clock::from_ticks(0);
         let state = State { high: false, rise: start, start, taken: 0, pulses: 0, gain: 1, sample: 0 };
-        Hx71x { chip, samples_per_s: samples_per_s.into(), cell, state: Together::new(state.words()) }
+        Hx71x { chip, samples_per_s: samples_per_s.into(), cell, state: Seqlock::new(state.words()) }
     }
 
     /// Number of finished conversions since the start that were not taken.

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use crate::engine::together::Together;
+use crate::engine::seqlock::Seqlock;
 use crate::engine::wire::{Kind, Wire};
 use pinion_firmware::time::Clock;
 
@@ -44,12 +44,12 @@ impl Conversions {
 pub(crate) struct ReadyLine {
     /// For example `interrupt of ldc1612`.
     name: &'static str,
-    conversions: Together<4>,
+    conversions: Seqlock<4>,
 }
 
 impl ReadyLine {
     pub(crate) fn new(name: &'static str) -> Arc<ReadyLine> {
-        Arc::new(ReadyLine { name, conversions: Together::new(Conversions::NONE.words()) })
+        Arc::new(ReadyLine { name, conversions: Seqlock::new(Conversions::NONE.words()) })
     }
 
     pub(crate) fn tell(&self, conversions: Conversions) {

@@ -17,8 +17,8 @@ use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::look::Look;
+use crate::engine::seqlock::Seqlock;
 use crate::engine::time::seconds;
-use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
@@ -109,7 +109,7 @@ struct Servo {
     /// When the current pulse began.
     pulse: AtomicU64,
     /// The start of the turn, its first angle and its target.
-    turn: Together<3>,
+    turn: Seqlock<3>,
 }
 
 impl Servo {
@@ -120,7 +120,7 @@ impl Servo {
             name: config.name(),
             config: config.clone(),
             pulse: AtomicU64::new(NO_PULSE),
-            turn: Together::new([now.ticks(), stop, stop]),
+            turn: Seqlock::new([now.ticks(), stop, stop]),
         }
     }
 

@@ -14,7 +14,7 @@ use pinion_linux::clock::Monotonic;
 use super::*;
 
 /// A page that is shared with the guardian is never freed, so there is only one.
-static PULSE: LazyLock<Pulse> = LazyLock::new(|| Pulse::new(Monotonic::start()).expect("a page"));
+static PULSE: LazyLock<Heartbeat> = LazyLock::new(|| Heartbeat::new(Monotonic::start()).expect("a page"));
 /// The same for the memory of a recording.
 static RECORDING: LazyLock<Recording> = LazyLock::new(Recording::of_a_test);
 

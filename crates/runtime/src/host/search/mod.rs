@@ -33,7 +33,7 @@ use pinion_linux::sys;
 
 use crate::core::responses::LinkWake;
 use crate::process::forked::THREADS_MAX;
-use crate::status::HostBoard;
+use crate::status::HostStatus;
 use crate::trouble::{NO_PROCESS, refused};
 use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
@@ -93,7 +93,7 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
 pub(crate) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
-    board: Arc<HostBoard>,
+    board: Arc<HostStatus>,
     answers: Receiver<(u32, DialectName)>,
     /// The number of the last question.
     asked: u32,
@@ -106,16 +106,16 @@ impl HostFinder {
         search: HostSearch,
         device: &Path,
         wake: Arc<LinkWake>,
-        board: Arc<HostBoard>,
+        board: Arc<HostStatus>,
     ) -> io::Result<HostFinder> {
         let terminal = Terminal::of(device)?;
         let socket = Arc::new(search.0);
         let (tell, answers) = channel();
-        let (ear, shown) = (socket.clone(), board.clone());
+        let (monitor, shown) = (socket.clone(), board.clone());
         thread::Builder::new().name("host".into()).spawn(move || {
             let mut message = vec![0; MESSAGE_BYTES_MAX];
             // This ends when nobody asks any more.
-            while let Ok(bytes) = receive(&ear, &mut message) {
+            while let Ok(bytes) = receive(&monitor, &mut message) {
                 let Some(answer) = Answer::decode(bytes) else { break };
                 for line in &answer.lines {
                     log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);

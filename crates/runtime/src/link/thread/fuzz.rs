@@ -18,18 +18,18 @@ use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox as _};
 use pinion_firmware::time::VirtualClock;
 use pinion_linux::clock::Monotonic;
 use pinion_protocol::block::{BLOCK_MAX, Found, PAYLOAD_MAX, Received, Receiver, Resync, Sequence, frame};
-use pinion_sync::calls::Progress;
+use pinion_sync::progress::Progress;
 
 use super::*;
-use crate::core::heartbeat::Pulse;
-use crate::core::responses::{LinkWake, Outlet, outlet};
+use crate::core::heartbeat::Heartbeat;
+use crate::core::responses::{LinkWake, ResponseWriter, response_ring};
 use crate::core::start::REQUESTS;
 use crate::link::ledger::Ledger;
 use crate::process::notify::Notify;
 use crate::process::signals::Signals;
 use crate::process::watchdog::Vigil;
 use crate::recorder::Recording;
-use crate::status::HostBoard;
+use crate::status::HostStatus;
 use crate::transport::Link as _;
 use crate::transport::pty::{Access, Pty};
 
@@ -40,7 +40,7 @@ static RECORDING: LazyLock<Recording> = LazyLock::new(Recording::of_a_test);
 const PENDING_MAX: u32 = 12;
 
 /// Made only once: to compress a dictionary takes milliseconds, and a page that is shared with a guardian is never freed.
-static ONCE: OnceLock<(Arc<Dialect>, Pulse)> = OnceLock::new();
+static ONCE: OnceLock<(Arc<Dialect>, Heartbeat)> = OnceLock::new();
 
 fn clock() -> Arc<VirtualClock> {
     Arc::new(VirtualClock::at(Clock::from_ticks(0)))
@@ -50,7 +50,7 @@ fn clock() -> Arc<VirtualClock> {
 pub fn link(mut bytes: &[u8], board: impl FnOnce(Arc<VirtualClock>) -> Box<dyn Board>) {
     let once = ONCE.get_or_init(|| {
         let dialect = Dialect::new(&crate::FIRMWARE, &*board(clock()), DialectName::Of(Generation::Master));
-        (Arc::new(dialect.expect("a dictionary")), Pulse::new(Monotonic::start()).expect("a page"))
+        (Arc::new(dialect.expect("a dictionary")), Heartbeat::new(Monotonic::start()).expect("a page"))
     });
     let mut bench = Bench::new(once);
     while let Some((&step, rest)) = bytes.split_first() {
@@ -67,12 +67,12 @@ pub fn link(mut bytes: &[u8], board: impl FnOnce(Arc<VirtualClock>) -> Box<dyn B
             2 => bench.ask(count),
             3 => bench.listen(),
             4 => bench.core.begin(),
-            5 => bench.core.outlet.send(&[count as u8; PAYLOAD_MAX][..2 * count.min(PAYLOAD_MAX / 2)]),
+            5 => bench.core.response_ring.send(&[count as u8; PAYLOAD_MAX][..2 * count.min(PAYLOAD_MAX / 2)]),
             6 => bench.core.finish(),
             _ => match count {
                 0 => bench.leave(),
                 1 => bench.write(b"FORCE_SHUTDOWN\n"),
-                2 => bench.core.outlet.note(Note::Reset),
+                2 => bench.core.response_ring.note(Note::Reset),
                 _ => {}
             },
         }
@@ -85,7 +85,7 @@ pub fn link(mut bytes: &[u8], board: impl FnOnce(Arc<VirtualClock>) -> Box<dyn B
 struct Core {
     requests: Consumer<Request>,
     progress: Arc<Progress>,
-    outlet: Outlet,
+    response_ring: ResponseWriter,
     is_busy: bool,
     /// The blocks that it was handed.
     blocks: Vec<Vec<u8>>,
@@ -136,24 +136,24 @@ struct Bench {
 }
 
 impl Bench {
-    fn new((dialect, pulse): &'static (Arc<Dialect>, Pulse)) -> Bench {
+    fn new((dialect, heartbeat): &'static (Arc<Dialect>, Heartbeat)) -> Bench {
         let symlink = std::env::temp_dir().join(format!("pinion-fuzz-{}", std::process::id()));
         let access = Access { mode: 0o600, group: Some(getegid().to_string()) };
         let pty = Pty::open(&symlink, &access).expect("a terminal");
         let device = pty.terminal().expect("a terminal").to_owned();
         let (wake, progress) = (Arc::new(LinkWake::new().expect("an eventfd")), Arc::new(Progress::default()));
-        let (outlet, inlet) = outlet(wake.clone(), progress.clone());
+        let (response_ring, reader) = response_ring(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
         let (thread, ledger) = (thread::current(), Ledger::default());
-        let end = CoreEnd { requests, thread, inlet, progress: progress.clone(), wake, ledger, may_poll: false };
-        let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *pulse);
+        let end = CoreEnd { requests, thread, reader, progress: progress.clone(), wake, ledger, may_poll: false };
+        let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *heartbeat);
         let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil).expect("epoll");
-        let introduction = Introduction::of(dialect.clone());
-        let host = HostEnd::new(Box::new(pty), Arc::new(HostBoard::default()));
+        let handshake = Handshake::of(dialect.clone());
+        let host = HostEnd::new(Box::new(pty), Arc::new(HostStatus::default()));
         let (recorder, _) = Recorder::new(RECORDING.clone()).expect("one recorder at a time");
         Bench {
-            link: LinkThread::new(host, end, introduction, oversight, clock(), recorder),
-            core: Core { requests: inbox, progress, outlet, is_busy: false, blocks: Vec::new() },
+            link: LinkThread::new(host, end, handshake, oversight, clock(), recorder),
+            core: Core { requests: inbox, progress, response_ring, is_busy: false, blocks: Vec::new() },
             device,
             host: None,
             resync: Resync::default(),

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Signs of life in words that processes share. A sign is the time at which it was given, as a stamp: a count that
-//! wraps.
+//! Heartbeats in words that processes share. A beat is the time at which it was given, as a stamp: a count that wraps.
 
 use crate::atomic::{AtomicU32, Ordering};
 
@@ -10,33 +9,33 @@ const BEAT_AT: usize = 0;
 /// How long it may stay the last one.
 const SILENCE_MAX_MS: usize = 1;
 /// Whether a pending shutdown value stops the heartbeat.
-const OWES: usize = 2;
-/// The name of the debt: a text.
+const PENDING: usize = 2;
+/// The name of the output with that value: a text.
 const SUBJECT: usize = 3;
 
 /// A heartbeat. One thread beats, and any thread listens.
 #[derive(Clone, Copy, Debug)]
-pub struct Heart<'a>(&'a [AtomicU32]);
+pub struct SharedHeartbeat<'a>(&'a [AtomicU32]);
 
 /// What a listener hears.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Heard {
-    /// How long the heart may be silent. `None`: it owes something.
+pub struct LastBeat {
+    /// How long the next beat may take. `None`: a shutdown value is pending.
     pub silence_max_ms: Option<u32>,
     /// When its last beat was. It is at least as new as the limit.
     pub beat_at: u32,
 }
 
-impl<'a> Heart<'a> {
+impl<'a> SharedHeartbeat<'a> {
     /// A view of these words, more than three.
-    pub fn new(words: &'a [AtomicU32]) -> Heart<'a> {
-        Heart(words)
+    pub fn new(words: &'a [AtomicU32]) -> SharedHeartbeat<'a> {
+        SharedHeartbeat(words)
     }
 
-    /// Beats. The next beat comes before `silence_max_ms` are over. While the heart owes something, no beat counts.
+    /// Beats. The next beat comes before `silence_max_ms` are over. While a shutdown value is pending, no beat counts.
     #[inline]
     pub fn beat(self, at: u32, silence_max_ms: u32) {
-        if self.0[OWES].load(Ordering::Relaxed) == 0 {
+        if self.0[PENDING].load(Ordering::Relaxed) == 0 {
             self.0[BEAT_AT].store(at, Ordering::Relaxed);
         }
         // A listener that reads this limit also reads this beat, and no older one.
@@ -54,32 +53,32 @@ impl<'a> Heart<'a> {
         self.0[SILENCE_MAX_MS].load(Ordering::Relaxed)
     }
 
-    /// From now on the heart owes `subject`. The first call is a sign of life, and a further one only replaces the
-    /// subject. It does not allocate. Only the thread that beats calls this.
-    pub fn owe(self, subject: &str, at: u32) {
-        if self.0[OWES].load(Ordering::Relaxed) == 0 {
+    /// From now on the shutdown value of `subject` is pending. The first call is a beat, and a further one only replaces
+    /// the subject. It does not allocate. Only the thread that beats calls this.
+    pub fn set_pending(self, subject: &str, at: u32) {
+        if self.0[PENDING].load(Ordering::Relaxed) == 0 {
             self.0[BEAT_AT].store(at, Ordering::Relaxed);
         }
         self.subject().set(subject);
-        self.0[OWES].store(1, Ordering::Release);
+        self.0[PENDING].store(1, Ordering::Release);
     }
 
-    /// Nothing is owed any more. This is a sign of life. Only the thread that beats calls this.
-    pub fn paid(self, at: u32) {
+    /// No shutdown value is pending any more. This is a beat. Only the thread that beats calls this.
+    pub fn clear_pending(self, at: u32) {
         self.0[BEAT_AT].store(at, Ordering::Relaxed);
-        // A listener that no longer sees the debt also reads this beat. The last one may be as old as the debt, and too
-        // old for the limit without a debt.
-        self.0[OWES].store(0, Ordering::Release);
+        // A listener that no longer sees the pending value also reads this beat. The last one may be as old as the pending
+        // value, and too old for the limit without one.
+        self.0[PENDING].store(0, Ordering::Release);
     }
 
     /// What can be heard now.
-    pub fn listen(self) -> Heard {
+    pub fn listen(self) -> LastBeat {
         // The beat is read last.
-        let silence_max_ms = match self.0[OWES].load(Ordering::Acquire) {
+        let silence_max_ms = match self.0[PENDING].load(Ordering::Acquire) {
             0 => Some(self.0[SILENCE_MAX_MS].load(Ordering::Acquire)),
             _ => None,
         };
-        Heard { silence_max_ms, beat_at: self.0[BEAT_AT].load(Ordering::Relaxed) }
+        LastBeat { silence_max_ms, beat_at: self.0[BEAT_AT].load(Ordering::Relaxed) }
     }
 
     /// What it owes.
@@ -120,12 +119,12 @@ impl Text<'_> {
 
 /// Words that show since when a worker is at its present job (0 without one), and the worker's name.
 #[derive(Clone, Copy, Debug)]
-pub struct Slot<'a>(&'a [AtomicU32]);
+pub struct JobSlot<'a>(&'a [AtomicU32]);
 
-impl<'a> Slot<'a> {
+impl<'a> JobSlot<'a> {
     /// A view of these words, more than one.
-    pub fn new(words: &'a [AtomicU32]) -> Slot<'a> {
-        Slot(words)
+    pub fn new(words: &'a [AtomicU32]) -> JobSlot<'a> {
+        JobSlot(words)
     }
 
     /// A slot without a name is free. Only one thread gives slots to workers.

@@ -5,15 +5,15 @@
 
 use std::sync::atomic::AtomicU64;
 
-use pinion_sync::together;
+use pinion_sync::seqlock;
 
 /// A few words that belong together. One thread writes them, and any thread reads them whole.
 #[derive(Debug)]
-pub struct Together<const N: usize>(together::Together<Box<[AtomicU64]>>);
+pub struct Seqlock<const N: usize>(seqlock::Seqlock<Box<[AtomicU64]>>);
 
-impl<const N: usize> Together<N> {
-    pub fn new(words: [u64; N]) -> Together<N> {
-        Together(together::Together::of(&words))
+impl<const N: usize> Seqlock<N> {
+    pub fn new(words: [u64; N]) -> Seqlock<N> {
+        Seqlock(seqlock::Seqlock::of(&words))
     }
 
     pub fn load(&self) -> [u64; N] {

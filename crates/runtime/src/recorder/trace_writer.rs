@@ -42,7 +42,7 @@ pub(super) enum News {
 }
 
 /// What the core records.
-pub(crate) struct Tape {
+pub(crate) struct TraceWriter {
     recent: Writer,
     lasting: Writer,
     news: Producer<News>,
@@ -91,10 +91,10 @@ pub struct Sleep {
     pub until: Clock,
 }
 
-impl Tape {
-    pub(super) fn new((recent, lasting): (Writer, Writer), news: Producer<News>, wake: Arc<EventFd>) -> Tape {
+impl TraceWriter {
+    pub(super) fn new((recent, lasting): (Writer, Writer), news: Producer<News>, wake: Arc<EventFd>) -> TraceWriter {
         let (before, pace_at) = (State::default(), Clock::EPOCH);
-        Tape { recent, lasting, news, wake, before, block: 0, worst: Ticks(0), pace_at }
+        TraceWriter { recent, lasting, news, wake, before, block: 0, worst: Ticks(0), pace_at }
     }
 
     /// The core's thread, which calls this, has started.

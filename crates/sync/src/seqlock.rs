@@ -14,24 +14,24 @@ use crate::atomic::{AtomicU64, Ordering, fence};
 ///
 /// The first word is how many times the words were stored. Its lowest bit is the place of the last ones.
 #[derive(Clone, Copy, Debug)]
-pub struct Together<W = &'static [AtomicU64]>(W);
+pub struct Seqlock<W = &'static [AtomicU64]>(W);
 
 /// Number of words for this many that belong together.
 pub const fn words(together: usize) -> usize {
     1 + 2 * together
 }
 
-impl Together<Box<[AtomicU64]>> {
+impl Seqlock<Box<[AtomicU64]>> {
     /// Words of this process.
     pub fn of(words: &[u64]) -> Self {
-        Together([0].iter().chain(words).chain(words).map(|word| AtomicU64::new(*word)).collect())
+        Seqlock([0].iter().chain(words).chain(words).map(|word| AtomicU64::new(*word)).collect())
     }
 }
 
-impl<W: Deref<Target = [AtomicU64]>> Together<W> {
+impl<W: Deref<Target = [AtomicU64]>> Seqlock<W> {
     /// A view of these words, an odd number. They are zero, or were already used for this.
-    pub fn new(words: W) -> Together<W> {
-        Together(words)
+    pub fn new(words: W) -> Seqlock<W> {
+        Seqlock(words)
     }
 
     fn place(&self, stores: u64) -> &[AtomicU64] {
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn words_that_belong_together_are_never_seen_apart() {
-        let words = Together::of(&[0; 4]);
+        let words = Seqlock::of(&[0; 4]);
         let done = AtomicBool::new(false);
         thread::scope(|scope| {
             scope.spawn(|| {
@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
-        let words = Together::of(&[1; 3]);
+        let words = Seqlock::of(&[1; 3]);
         words.store([2; 3]);
         // The first word of the next store.
         words.place(2)[0].store(3, Ordering::Relaxed);
