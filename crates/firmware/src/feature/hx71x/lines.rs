@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn the_second_worker_lowers_the_clock_if_the_first_is_interrupted() {
         for interrupted in [0, 7, 24] {
-            let (mut shift, mut watcher, chip) = workers(Some(interrupted), 1000);
+            let (mut shift, mut watcher, chip) = workers(Some(interrupted), 10_000);
             let shifted = thread::scope(|scope| {
                 scope.spawn(move || watcher.run().unwrap());
                 shift.run().unwrap()
