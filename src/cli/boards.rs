@@ -65,7 +65,10 @@ impl Board {
                     let [theirs, ours] = [&theirs, &names].map(|names| names.trim_end_matches('\0'));
                     assert_eq!(theirs, ours, "{} of a {}", chip.node, self.model);
                     let node = tree.computer().path(format!("/proc/device-tree{}", chip.node));
-                    tree.link(&format!("{device}/of_node"), node.to_str().unwrap());
+                    // Two chips may be banks of one device.
+                    if !tree.computer().path(format!("/{device}/of_node")).exists() {
+                        tree.link(&format!("{device}/of_node"), node.to_str().unwrap());
+                    }
                 }
                 None if names.is_empty() => {}
                 None => tree.put(&format!("{device}/of_node/gpio-line-names"), names + "\0"),

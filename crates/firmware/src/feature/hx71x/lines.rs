@@ -323,6 +323,36 @@ mod tests {
         }
     }
 
+    /// A clock with steps of 2 ms.
+    struct Coarse;
+
+    impl TimeSource for Coarse {
+        fn now(&self) -> Clock {
+            Clock::EPOCH
+        }
+
+        fn instant_of(&self, _: Duration) -> Clock {
+            Clock::EPOCH
+        }
+
+        fn duration_of(&self, _: Clock) -> Duration {
+            Duration::ZERO
+        }
+
+        fn step_ns(&self) -> u32 {
+            2_000_000
+        }
+    }
+
+    #[test]
+    fn a_pulse_is_surely_long_enough_on_a_coarse_clock() {
+        let (mut shift, ..) = workers(None, 1);
+        shift.time = Arc::new(Coarse);
+        let began = Instant::now();
+        shift.wait();
+        assert!(began.elapsed() >= Duration::from_nanos(2_000_200), "200 ns may be none on this clock");
+    }
+
     #[test]
     fn a_worker_without_a_second_one_reads_alone() {
         let (mut shift, watcher, chip) = workers(None, 100);
