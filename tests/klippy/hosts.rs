@@ -88,8 +88,7 @@ fn kalico_uses_a_serial_port_and_an_spi_bus_as_pins() {
     assert!(!printer.log().contains("TMC UART ttyAMA1") && !printer.log().contains("HX71x sclk"), "{}", printer.log());
 }
 
-/// Moves with parts of ticks and a changing acceleration (`queue_step_hp`), on a serious print: curves, retractions and
-/// pressure advance. klippy counts the steps that it has sent, and the printer those that its motors made.
+/// Moves with parts of ticks and a changing acceleration (`queue_step_hp`): curves, retractions and pressure advance.
 #[test]
 fn kalico_prints_with_steps_of_high_precision() {
     let Some(checkout) = folder_of("KALICO_BLEEDING_EDGE") else { return };
