@@ -256,7 +256,7 @@ impl Watcher {
                 match self.take_message() {
                     Incoming::Message if self.held.is_empty() => monitor = None,
                     Incoming::Message => {
-                        drop(monitor.get_or_insert_with(|| HeartbeatMonitor::new(self.heartbeat, self.heartbeat.now())))
+                        monitor.get_or_insert_with(|| HeartbeatMonitor::new(self.heartbeat, self.heartbeat.now()));
                     }
                     Incoming::Goodbye => return,
                     Incoming::Closed => break Cause::Died,
