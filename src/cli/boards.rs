@@ -1,10 +1,16 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! For tests: boards that people own, as folders of a computer and as what Pinion finds there.
 //!
-//! Models and names of lines are those of the device trees in Debian 13 (Linux 6.12.107), in its backports (7.3.4), and in
+//! Models and names of lines are those of the device trees in Debian 13 (Linux 6.12), in its backports (7.3.4), and in
 //! Raspberry Pi OS. The drivers choose labels, numbers of lines, and the order of the chips.
+//!
+//! With the device trees of Debian 13's kernel in the folder `PINION_DEVICE_TREES`, the tests use these files, and compare
+//! the boards here with them. `make test-raspberry-pi` does so.
 
+use std::collections::BTreeMap;
+use std::env;
 use std::fs;
+use std::path::PathBuf;
 
 use pinion_linux::Inventory;
 use pinion_linux::gpio::{Chip, LineInfo};
@@ -17,6 +23,8 @@ struct BoardChip {
     label: &'static str,
     /// Its device below /sys/devices/platform.
     device: &'static str,
+    /// Its node in Debian 13's device tree.
+    node: &'static str,
     line_count: usize,
     /// The names of its first lines.
     names: Vec<&'static str>,
@@ -25,6 +33,8 @@ struct BoardChip {
 /// A board.
 pub(super) struct Board {
     model: &'static str,
+    /// Its file in Debian 13's kernel. `None` if the board has another device tree.
+    device_tree: Option<&'static str>,
     chips: Vec<BoardChip>,
     /// Links and nodes in /dev besides its chips. A link has its target behind an arrow.
     dev: &'static [&'static str],
@@ -36,12 +46,32 @@ impl Board {
     /// The files by which Linux describes the board.
     pub(super) fn tree(&self) -> Tree {
         let tree = Tree::new();
-        tree.put("proc/device-tree/model", &format!("{}\0", self.model));
+        let debian = self.device_tree.and_then(debian_s);
+        for (node, properties) in debian.iter().flatten() {
+            for (name, value) in properties {
+                tree.put(&format!("proc/device-tree{node}/{name}"), value);
+            }
+        }
+        // The firmware of a Raspberry Pi completes its model.
+        tree.put("proc/device-tree/model", format!("{}\0", self.model));
         for chip in &self.chips {
             let (number, device) = (chip.number, format!("sys/devices/platform/{}", chip.device));
             tree.put(&format!("dev/gpiochip{number}"), "");
-            if !chip.names.is_empty() {
-                tree.put(&format!("{device}/of_node/gpio-line-names"), &(chip.names.join("\0") + "\0"));
+            let names = chip.names.join("\0");
+            match &debian {
+                Some(nodes) => {
+                    let theirs = nodes[chip.node].get("gpio-line-names");
+                    let theirs = theirs.map_or_else(String::new, |names| String::from_utf8_lossy(names).into_owned());
+                    let [theirs, ours] = [&theirs, &names].map(|names| names.trim_end_matches('\0'));
+                    assert_eq!(theirs, ours, "{} of a {}", chip.node, self.model);
+                    let node = tree.computer().path(format!("/proc/device-tree{}", chip.node));
+                    // Two chips may be banks of one device.
+                    if !tree.computer().path(format!("/{device}/of_node")).exists() {
+                        tree.link(&format!("{device}/of_node"), node.to_str().unwrap());
+                    }
+                }
+                None if names.is_empty() => {}
+                None => tree.put(&format!("{device}/of_node/gpio-line-names"), names + "\0"),
             }
             tree.put(&format!("{device}/gpiochip{number}/dev"), &format!("254:{number}\n"));
             let link = format!("sys/bus/gpio/devices/gpiochip{number}");
@@ -94,11 +124,13 @@ pub(super) fn pi4() -> Board {
                  RGMII_RXD1 RGMII_RXD2 RGMII_RXD3 RGMII_TXCLK RGMII_TXCTL RGMII_TXD0 RGMII_TXD1 RGMII_TXD2 RGMII_TXD3";
     Board {
         model: "Raspberry Pi 4 Model B",
+        device_tree: Some("broadcom/bcm2711-rpi-4-b.dtb"),
         chips: vec![
             BoardChip {
                 number: 0,
                 label: "pinctrl-bcm2711",
                 device: "soc/fe200000.gpio",
+                node: "/soc/gpio@7e200000",
                 line_count: 58,
                 names: named(names),
             },
@@ -106,6 +138,7 @@ pub(super) fn pi4() -> Board {
                 number: 1,
                 label: EXPANDER,
                 device: "soc/soc:firmware/soc:firmware:gpio",
+                node: "/soc/firmware/gpio",
                 line_count: 8,
                 names: named("BT_ON WL_ON PWR_LED_OFF GLOBAL_RESET VDD_SD_IO_SEL CAM_GPIO SD_PWR_ON"),
             },
@@ -123,10 +156,12 @@ pub(super) fn zero2() -> Board {
                  SMPS_SCL SMPS_SDA SD_CLK_R SD_CMD_R SD_DATA0_R SD_DATA1_R SD_DATA2_R SD_DATA3_R";
     Board {
         model: "Raspberry Pi Zero 2 W",
+        device_tree: Some("broadcom/bcm2837-rpi-zero-2-w.dtb"),
         chips: vec![BoardChip {
             number: 0,
             label: "pinctrl-bcm2835",
             device: "soc/3f200000.gpio",
+            node: "/soc/gpio@7e200000",
             line_count: 54,
             names: named(names),
         }],
@@ -141,6 +176,8 @@ fn brcmstb(chips: &[(u32, &'static str, &'static str, usize)]) -> Vec<BoardChip>
         number: *number,
         label,
         device,
+        // Only the chip of Debian 13's own kernel is compared. It has two banks of lines.
+        node: "/soc@107c000000/gpio@7d517c00",
         line_count: *line_count,
         names: vec![],
     };
@@ -152,6 +189,7 @@ fn rp1(number: u32, names: Vec<&'static str>) -> BoardChip {
         number,
         label: "pinctrl-rp1",
         device: "axi/1000120000.pcie/pci0002:00/0002:00:00.0/0002:01:00.0/1f000d0000.gpio",
+        node: "",
         line_count: 54,
         names,
     }
@@ -173,6 +211,7 @@ pub(super) fn pi5() -> Board {
     chips.push(rp1(15, named(names)));
     Board {
         model: "Raspberry Pi 5 Model B Rev 1.0",
+        device_tree: None,
         chips,
         dev: &["i2c-1", "gpiomem0"],
         pwm: &[(0, "1f00098000.pwm", 4), (1, "107d517a80.pwm", 2)],
@@ -188,7 +227,7 @@ pub(super) fn pi5_debian() -> Board {
         (3, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
     ]);
     chips.push(rp1(4, vec![]));
-    Board { model: "Raspberry Pi 5 Model B Rev 1.0", chips, dev: &[], pwm: &[] }
+    Board { model: "Raspberry Pi 5 Model B Rev 1.0", device_tree: None, chips, dev: &[], pwm: &[] }
 }
 
 /// A Raspberry Pi 5 with Debian 13. Its kernel has no driver for the header.
@@ -197,17 +236,25 @@ pub(super) fn pi5_without_header() -> Board {
         (0, "gpio-brcmstb@107d517c00", "soc@107c000000/107d517c00.gpio", 17),
         (1, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
     ]);
-    Board { model: "Raspberry Pi 5 Model B Rev 1.0", chips, dev: &[], pwm: &[] }
+    Board {
+        model: "Raspberry Pi 5 Model B Rev 1.0",
+        device_tree: Some("broadcom/bcm2712-rpi-5-b.dtb"),
+        chips,
+        dev: &[],
+        pwm: &[],
+    }
 }
 
 /// A BigTreeTech CB1 (Allwinner H616) with Debian. No line has a name.
 pub(super) fn cb1() -> Board {
-    let chip = |number, label, device, line_count| BoardChip { number, label, device, line_count, names: vec![] };
+    let chip =
+        |number, label, device, node, line_count| BoardChip { number, label, device, node, line_count, names: vec![] };
     Board {
         model: "BigTreeTech CB1",
+        device_tree: Some("allwinner/sun50i-h616-bigtreetech-cb1-manta.dtb"),
         chips: vec![
-            chip(0, "300b000.pinctrl", "soc/300b000.pinctrl", 288),
-            chip(1, "7022000.pinctrl", "soc/7022000.pinctrl", 32),
+            chip(0, "300b000.pinctrl", "soc/300b000.pinctrl", "/soc/pinctrl@300b000", 288),
+            chip(1, "7022000.pinctrl", "soc/7022000.pinctrl", "/soc/pinctrl@7022000", 32),
         ],
         dev: &["i2c-0", "spidev1.0"],
         pwm: &[],
@@ -216,22 +263,105 @@ pub(super) fn cb1() -> Board {
 
 /// A Radxa ZERO 3W (Rockchip RK3566) with Debian. The names of its lines are not for klippy: they have a space.
 pub(super) fn rk3566() -> Board {
-    let chip = |number, label, device, names: &[(usize, &'static str)]| {
+    let chip = |number, label, device, node, names: &[(usize, &'static str)]| {
         let mut all = vec![""; 32];
         names.iter().for_each(|(line, name)| all[*line] = name);
-        BoardChip { number, label, device, line_count: 32, names: all }
+        BoardChip { number, label, device, node, line_count: 32, names: all }
     };
+    let bank_1 = [(0, "pin-03 [GPIO1_A0]"), (1, "pin-05 [GPIO1_A1]"), (4, "pin-37 [GPIO1_A4]")];
+    let bank_3 = [
+        (1, "pin-11 [GPIO3_A1]"),
+        (2, "pin-13 [GPIO3_A2]"),
+        (3, "pin-12 [GPIO3_A3]"),
+        (4, "pin-35 [GPIO3_A4]"),
+        (5, "pin-40 [GPIO3_A5]"),
+        (6, "pin-38 [GPIO3_A6]"),
+        (7, "pin-36 [GPIO3_A7]"),
+        (8, "pin-15 [GPIO3_B0]"),
+        (9, "pin-16 [GPIO3_B1]"),
+        (10, "pin-18 [GPIO3_B2]"),
+        (11, "pin-29 [GPIO3_B3]"),
+        (12, "pin-31 [GPIO3_B4]"),
+        (17, "pin-22 [GPIO3_C1]"),
+        (18, "pin-32 [GPIO3_C2]"),
+        (19, "pin-33 [GPIO3_C3]"),
+        (20, "pin-07 [GPIO3_C4]"),
+    ];
+    let bank_4 = [
+        (10, "pin-27 [GPIO4_B2]"),
+        (11, "pin-28 [GPIO4_B3]"),
+        (18, "pin-23 [GPIO4_C2]"),
+        (19, "pin-19 [GPIO4_C3]"),
+        (21, "pin-21 [GPIO4_C5]"),
+        (22, "pin-24 [GPIO4_C6]"),
+    ];
     Board {
         model: "Radxa ZERO 3W",
+        device_tree: Some("rockchip/rk3566-radxa-zero-3w.dtb"),
         chips: vec![
-            chip(0, "gpio0", "pinctrl/fdd60000.gpio", &[(24, "pin-10 [GPIO0_D0]"), (25, "pin-08 [GPIO0_D1]")]),
-            chip(1, "gpio1", "pinctrl/fe740000.gpio", &[(0, "pin-03 [GPIO1_A0]"), (4, "pin-37 [GPIO1_A4]")]),
-            chip(2, "gpio2", "pinctrl/fe750000.gpio", &[]),
-            chip(3, "gpio3", "pinctrl/fe760000.gpio", &[(1, "pin-11 [GPIO3_A1]"), (17, "pin-22 [GPIO3_C1]")]),
-            chip(4, "gpio4", "pinctrl/fe770000.gpio", &[(10, "pin-27 [GPIO4_B2]"), (18, "pin-23 [GPIO4_C2]")]),
+            chip(
+                0,
+                "gpio0",
+                "pinctrl/fdd60000.gpio",
+                "/pinctrl/gpio@fdd60000",
+                &[(24, "pin-10 [GPIO0_D0]"), (25, "pin-08 [GPIO0_D1]")],
+            ),
+            chip(1, "gpio1", "pinctrl/fe740000.gpio", "/pinctrl/gpio@fe740000", &bank_1),
+            chip(2, "gpio2", "pinctrl/fe750000.gpio", "/pinctrl/gpio@fe750000", &[]),
+            chip(3, "gpio3", "pinctrl/fe760000.gpio", "/pinctrl/gpio@fe760000", &bank_3),
+            chip(4, "gpio4", "pinctrl/fe770000.gpio", "/pinctrl/gpio@fe770000", &bank_4),
         ],
         dev: &["i2c-3"],
         pwm: &[(0, "fe700000.pwm", 1)],
+    }
+}
+
+/// The nodes of a device tree by their paths, with their properties.
+type Nodes = BTreeMap<String, BTreeMap<String, Vec<u8>>>;
+
+/// A device tree of Debian's kernel, if the folder with these files is known.
+fn debian_s(file: &str) -> Option<Nodes> {
+    let file = PathBuf::from(env::var_os("PINION_DEVICE_TREES")?).join(file);
+    Some(nodes(&fs::read(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()))))
+}
+
+/// Reads a device tree ("Devicetree Specification", chapter 5).
+fn nodes(blob: &[u8]) -> Nodes {
+    const BEGIN_NODE: usize = 1;
+    const END_NODE: usize = 2;
+    const PROPERTY: usize = 3;
+    const END: usize = 9;
+    let number = |at: usize| u32::from_be_bytes(blob[at..at + 4].try_into().unwrap()) as usize;
+    let text = |at: usize| {
+        let bytes = blob[at..].iter().take_while(|byte| **byte != 0);
+        bytes.map(|byte| char::from(*byte)).collect::<String>()
+    };
+    let (mut at, strings) = (number(8), number(12));
+    let (mut path, mut nodes) = (Vec::new(), Nodes::new());
+    loop {
+        let (token, next) = (number(at), at + 4);
+        at = match token {
+            BEGIN_NODE => {
+                let name = text(next);
+                let end = next + name.len() + 1;
+                path.push(name);
+                nodes.insert(path.join("/"), BTreeMap::new());
+                end
+            }
+            END_NODE => {
+                path.pop();
+                next
+            }
+            PROPERTY => {
+                let (length, value) = (number(next), next + 8);
+                let properties = nodes.get_mut(&path.join("/")).unwrap();
+                properties.insert(text(strings + number(next + 4)), blob[value..value + length].to_vec());
+                value + length
+            }
+            END => return nodes,
+            _ => next,
+        }
+        .next_multiple_of(4);
     }
 }
 

@@ -23,7 +23,7 @@ use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::uart;
 use pinion_runtime::FIRMWARE;
 use pinion_runtime::realtime::{self, Processors};
-use pinion_runtime::{CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid};
+use pinion_runtime::{CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid, stdio_can_use};
 
 use super::computer::Computer;
 use super::computer::manager::{SYSTEMCTL, watchdog_of_systemd};
@@ -44,6 +44,10 @@ pub(super) fn run(settings: &Settings, file: Option<&Path>, simulated: Open) -> 
             findings.push(link(symlink));
             findings.push(group(settings.access.group.as_deref()));
         }
+        LinkName::Stdio => findings.push(match stdio_can_use() {
+            Ok(()) => wire(&LinkName::Stdio),
+            Err(trouble) => Finding::of("link", Level::Error, trouble),
+        }),
         other => findings.push(wire(other)),
     }
     findings.extend(real_time(settings));

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Hosts of every generation on the whole simulated printer. Each has its own checkout: `KLIPPER_DIR_V0_11`, `_V0_12`,
-//! `_V0_13`, `_MASTER` and `_KALICO`.
+//! `_V0_13`, `_MASTER` and `_KALICO`. Kalico's branch `bleeding-edge-v2` has `KLIPPER_DIR_KALICO_BLEEDING_EDGE`.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -13,11 +13,16 @@ use super::probes::on_spi;
 
 /// The checkout of a generation; `None` if there is none.
 pub fn checkout(generation: Generation) -> Option<PathBuf> {
-    let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
+    folder_of(&generation.name().to_uppercase().replace('.', "_"))
+}
+
+/// The checkout in the variable `KLIPPER_DIR_` with this end; `None` if there is none.
+fn folder_of(host: &str) -> Option<PathBuf> {
+    let variable = format!("KLIPPER_DIR_{host}");
     let folder = std::env::var_os(&variable).map(PathBuf::from);
     if folder.is_none() {
         let skipped =
-            format!("\nSKIPPED the host {generation}: {variable} is not set; set it to a checkout of that version\n");
+            format!("\nSKIPPED the host {host}: {variable} is not set; set it to a checkout of that version\n");
         let _ = std::io::stderr().write_all(skipped.as_bytes());
     }
     folder
@@ -81,6 +86,45 @@ fn kalico_uses_a_serial_port_and_an_spi_bus_as_pins() {
     assert!((79.0..81.0).contains(&rate), "{said}");
     printer.gcode("G28 X Y\nG1 X50 Y40 F6000\nM400");
     assert!(!printer.log().contains("TMC UART ttyAMA1") && !printer.log().contains("HX71x sclk"), "{}", printer.log());
+}
+
+/// Moves with parts of ticks and a changing acceleration (`queue_step_hp`), on a serious print: curves, retractions and
+/// pressure advance. klippy counts the steps that it has sent, and the printer those that its motors made.
+#[test]
+fn kalico_prints_with_steps_of_high_precision() {
+    let Some(checkout) = folder_of("KALICO_BLEEDING_EDGE") else { return };
+    let mut printer = Printer::start_here(
+        &checkout,
+        |board, _| board,
+        |config| {
+            let config = without(&config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n"), "angle y");
+            // Kalico names its load cells in another way.
+            let config = without(&without(&config, "load_cell ads1220"), "load_cell");
+            let config = config.replace("min_extrude_temp: 170", "min_extrude_temp: 0\npressure_advance: 0.05");
+            let precise = config.replace("\nstep_pin:", "\nhigh_precision_step_compress: True\nstep_pin:");
+            assert_eq!(precise.matches("high_precision").count(), 4, "{precise}");
+            precise + "\n[gcode_arcs]\nresolution: 0.1\n"
+        },
+    );
+    printer.gcode("G28\nM83\nG1 X60 Y50 Z5 F6000");
+    for radius in [5, 12, 20] {
+        printer.gcode(&format!(
+            "G1 X{0} F9000\nG2 X{0} Y50 I{radius} J0 E1.5 F6000\nG3 X{0} Y50 I-{radius} J0 E1.5 F3000\nG1 E-0.8 F2400\nG1 E0.8",
+            60 + radius
+        ));
+    }
+    printer.gcode("G1 X30 Y70 Z8 F9000\nM400");
+    for (name, mm, step_mm) in [("x", 30.0, 0.0125), ("y", 70.0, 0.0125), ("z", 8.0, 0.0025), ("extruder", 9.0, 0.01)] {
+        let axis = printer.probe().axis(name).unwrap();
+        assert!((axis.position_mm - mm).abs() <= step_mm, "{name}: {} mm, not {mm}", axis.position_mm);
+        assert_eq!(axis.lost_steps, 0, "{name}");
+    }
+    // The endstops agree: they close at the place from which the print was counted.
+    printer.gcode("G28\nG1 X40 Y40 Z10 F6000\nM400");
+    for (name, mm, step_mm) in [("x", 40.0, 0.0125), ("y", 40.0, 0.0125), ("z", 10.0, 0.0025)] {
+        let position_mm = printer.probe().axis(name).unwrap().position_mm;
+        assert!((position_mm - mm).abs() <= step_mm, "{name}: {position_mm} mm");
+    }
 }
 
 /// Steppers, heaters and fan, hardware PWM, ADCs, thermocouple (SPI), DS18B20, accelerometer (SPI), drivers

@@ -124,7 +124,8 @@ fn a_link_that_run_refuses_is_an_error_of_the_check() {
     fs::write(&file, "").unwrap();
     let folder_itself = format!("serial:{}", folder.path().display());
     // No kernel has CAN on `lo`.
-    for link in [&*format!("serial:{}", file.display()), &folder_itself, "can:lo,0123456789ab"] {
+    let file = format!("serial:{}", file.display());
+    for link in [&*file, &folder_itself, "serial:/dev/null", "can:lo,0123456789ab"] {
         let run = |more: &[&str]| {
             let args = [&["run", "--board", "sim", "--link", link, "-I", "/tmp/klipper_host_refused"], more].concat();
             Command::new(pinion_path()).args(args).stdin(Stdio::null()).output().unwrap()
@@ -223,10 +224,12 @@ fn a_person_s_terminal_is_no_wire_and_a_program_s_may_be() {
         command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
         command
     };
-    let mut person = AtTerminal::start(&mut run(), 24, None);
-    assert_eq!(person.ended().code(), Some(1));
-    assert!(person.shown().contains("--link stdio: this terminal shows the log"), "{}", person.shown());
-    assert!(person.is_given_back());
+    for more in [&[][..], &["--check"]] {
+        let mut person = AtTerminal::start(run().args(more), 24, None);
+        assert_eq!(person.ended().code(), Some(1), "{more:?}");
+        assert!(person.shown().contains("--link stdio: this terminal shows the log"), "{}", person.shown());
+        assert!(person.is_given_back());
+    }
     // socat with its option `pty`: the log is not there.
     let log = folder.path().join("log");
     let _program = AtTerminal::start(&mut run(), 24, Some(fs::File::create(&log).unwrap().into()));

@@ -19,8 +19,9 @@ const KERNEL: &str = "linux-image-arm64";
 /// Begins an error of apt.
 const NOT_OFFERED: &str = "apt offers not all packages: check the network, and that its sources name a Debian archive";
 
-/// The first Debian whose QEMU has every board: QEMU 9 added the Raspberry Pi 4.
-const EMULATOR_RELEASE: &str = "trixie";
+/// The first Debian whose QEMU has every board: QEMU 9 added the Raspberry Pi 4. Its kernel has device trees of all boards
+/// of src/cli/boards.rs.
+const RELEASE: &str = "trixie";
 const EMULATOR_PACKAGE: &str = "qemu-system-arm";
 
 /// QEMU for ARM, unpacked with its libraries.
@@ -36,9 +37,9 @@ impl Emulator {
         let _lock = cache.lock()?;
         let root = cache.root().join("emulator");
         let architecture = process::output(Command::new("dpkg").arg("--print-architecture"))?;
-        let apt = Apt::open(&root.join("apt"), architecture.trim(), Some(EMULATOR_RELEASE))?;
-        let packages = Packages::of(&apt, Some(EMULATOR_PACKAGE), Vec::new())?;
-        let folder = packages.unpacked(&apt, &root, &format!("QEMU of Debian {EMULATOR_RELEASE}"))?;
+        let apt = Apt::open(&root.join("apt"), architecture.trim(), Some(RELEASE))?;
+        let packages = Packages::of(&apt, Some(EMULATOR_PACKAGE), Vec::new(), Vec::new())?;
+        let folder = packages.unpacked(&apt, &root, &format!("QEMU of Debian {RELEASE}"))?;
         let pattern = folder.join("usr/lib/*/ld-linux*.so.*");
         let mut loaders = glob::glob(&pattern.to_string_lossy()).map_err(|error| error.to_string())?;
         let loader = loaders.find_map(Result::ok).ok_or_else(|| format!("there is no {}", pattern.display()))?;
@@ -72,7 +73,10 @@ impl Kernel {
         let root = cache.root().join("arm64-kernel");
         let apt = Apt::open(&root.join("apt"), "arm64", None)?;
         let release = kernel_release(&apt)?;
-        let packages = Packages::of(&apt, None, vec![BUSYBOX.to_owned(), format!("linux-image-{release}")])?;
+        // Its modules are large, and all that is needed is built in.
+        let parts = BOARDS.iter().map(|board| format!("*/{}", board.device_tree));
+        let parts = parts.chain(["./boot/vmlinuz-*".to_owned()]).collect();
+        let packages = Packages::of(&apt, None, vec![BUSYBOX.to_owned(), image(&release)], parts)?;
         let folder = packages.unpacked(&apt, &root, &format!("Linux {release} of arm64"))?;
         Ok(Kernel { release, folder })
     }
@@ -88,6 +92,22 @@ impl Kernel {
     pub fn busybox(&self) -> PathBuf {
         self.folder.join("bin/busybox")
     }
+}
+
+/// Downloads the device trees of a newer kernel, unless the cache holds them. Returns their folder.
+pub fn device_trees(cache: &Cache) -> Result<PathBuf, String> {
+    let _lock = cache.lock()?;
+    let root = cache.root().join("device-trees");
+    let apt = Apt::open(&root.join("apt"), "arm64", Some(RELEASE))?;
+    let release = kernel_release(&apt)?;
+    let packages = Packages::of(&apt, None, vec![image(&release)], vec!["*.dtb".to_owned()])?;
+    let folder = packages.unpacked(&apt, &root, &format!("the device trees of Linux {release}"))?;
+    Ok(folder.join(format!("usr/lib/linux-image-{release}")))
+}
+
+/// The package of a kernel.
+fn image(release: &str) -> String {
+    format!("linux-image-{release}")
 }
 
 /// The release of its newest kernel, as `uname -r` prints it.
@@ -107,12 +127,19 @@ struct Packages {
     /// Unpacked with all that it depends on.
     whole: Option<&'static str>,
     alone: Vec<String>,
-    /// Their files' names; they contain the versions.
+    /// The files that are unpacked of a kernel.
+    parts_of_kernel: Vec<String>,
+    /// The archives' names; they contain the versions.
     files: Vec<String>,
 }
 
 impl Packages {
-    fn of(apt: &Apt, whole: Option<&'static str>, alone: Vec<String>) -> Result<Packages, String> {
+    fn of(
+        apt: &Apt,
+        whole: Option<&'static str>,
+        alone: Vec<String>,
+        parts_of_kernel: Vec<String>,
+    ) -> Result<Packages, String> {
         let print = |action: &str, packages: &[String]| -> Result<Vec<String>, String> {
             let mut command = apt.command("apt-get");
             command.args([action, "-qq", "--print-uris"]).args(packages);
@@ -127,14 +154,14 @@ impl Packages {
             }
         }
         files.sort();
-        Ok(Packages { whole, alone, files })
+        Ok(Packages { whole, alone, parts_of_kernel, files })
     }
 
     /// Changes with everything that is unpacked.
     fn key(&self) -> u64 {
         let mut hasher = DefaultHasher::new();
         include_str!("debian.rs").hash(&mut hasher);
-        BOARDS.each_ref().map(|board| board.device_tree).hash(&mut hasher);
+        self.parts_of_kernel.hash(&mut hasher);
         self.files.hash(&mut hasher);
         hasher.finish()
     }
@@ -171,13 +198,10 @@ impl Packages {
         }
         for file in &self.files {
             let archive = archives.join(file);
-            // Of the kernel only what boots: its modules are large and all that is
-            // needed is built in.
-            let mut parts = vec!["./*".to_owned()];
-            if file.starts_with("linux-image-") {
-                parts = vec!["./boot/vmlinuz-*".to_owned()];
-                parts.extend(BOARDS.iter().map(|board| format!("*/{}", board.device_tree)));
-            }
+            let parts = match file.starts_with("linux-image-") {
+                true => self.parts_of_kernel.clone(),
+                false => vec!["./*".to_owned()],
+            };
             let words = [archive.to_str(), folder.to_str()];
             let mut words: Vec<&str> = words.into_iter().map(|word| word.expect("it was UTF-8 before")).collect();
             words.extend(parts.iter().map(String::as_str));

@@ -11,7 +11,8 @@ mod debian;
 mod gpio;
 mod vm;
 
-use std::process::ExitCode;
+use std::env;
+use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 use board::{BOARDS, Board};
@@ -25,9 +26,10 @@ const USAGE: &str = "\
 Usage: cargo test --test raspberry_pi -- [OPTIONS] [FILTERS...]
 
 Runs the tests whose name, as in gpio::an_output_is_seen_from_outside, contains any
-of the filters, on each emulated board with the programs of each architecture. It
-installs compilers if they are missing and you are root, and downloads 200 MB the
-first time.
+of the filters, on each emulated board with the programs of each architecture.
+Without filters and options it first runs pinion's own tests of boards, with the
+device trees of Debian 13's kernel. It installs compilers if they are missing and you
+are root, and downloads 300 MB the first time.
 
 Options:
   --exact            A filter is a whole name
@@ -35,24 +37,34 @@ Options:
   --nocapture        Show the output of tests that pass, too
   --board BOARD      Only this board: raspi3b or raspi4b
   --arch ARCH        Only programs of this architecture: arm64 or armhf
+  --device-trees     Only the tests of boards with device trees
   --shell            A shell on the board instead of tests; Ctrl-A X ends it";
 
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
 fn main() -> ExitCode {
-    let mut shell = false;
+    let (mut shell, mut only_device_trees) = (false, false);
     let (mut machine, mut debian) = (None, None);
     let arguments = Arguments::read(USAGE, |option, value| {
         match option {
             "--shell" => shell = true,
+            "--device-trees" => only_device_trees = true,
             "--board" => machine = Some(value()?),
             "--arch" => debian = Some(value()?),
             _ => return Ok(false),
         }
         Ok(true)
     });
-    let ok = chosen(machine.as_deref(), debian.as_deref()).and_then(|systems| run(&arguments, &systems, shell));
+    let everything = !shell && machine.is_none() && debian.is_none() && arguments.for_libtest().is_empty();
+    let device_trees = match everything || only_device_trees {
+        true => Cache::open().and_then(|cache| boards_are_as_in_device_trees(&cache)),
+        false => Ok(true),
+    };
+    let ok = device_trees.and_then(|ok| match only_device_trees {
+        true => Ok(ok),
+        false => Ok(run(&arguments, &chosen(machine.as_deref(), debian.as_deref())?, shell)? && ok),
+    });
     match ok {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(FAILED),
@@ -101,6 +113,18 @@ fn run(arguments: &Arguments, systems: &[System], shell: bool) -> Result<bool, S
         ok &= report.finish(outcome, &vm);
     }
     Ok(ok)
+}
+
+/// Whether the tests of `src/cli/boards.rs` pass with the device trees of Debian's kernel.
+fn boards_are_as_in_device_trees(cache: &Cache) -> Result<bool, String> {
+    let folder = debian::device_trees(cache)?;
+    println!("the boards of src/cli/boards.rs with {}", folder.display());
+    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+    cargo
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .args(["test", "--locked", "--lib", "--", "board", "header", "config_txt"])
+        .env("PINION_DEVICE_TREES", folder);
+    cargo.status().map(|status| status.success()).map_err(|error| format!("cannot start cargo: {error}"))
 }
 
 /// Runs until the last test has ended. An error describes the end of the VM.

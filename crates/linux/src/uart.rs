@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::sys::stat::major;
+use nix::sys::stat::{major, minor};
 use nix::sys::termios::{ControlFlags, FlushArg, SetArg, cfmakeraw, tcdrain, tcflush, tcgetattr, tcsetattr};
 
 use pinion_firmware::board::SerialPort;
@@ -116,7 +116,8 @@ const RATE_ERROR_MAX: f64 = 0.025;
 pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
     let found = || {
         let target = fs::canonicalize(path).map_err(|error| cannot_open(path, &error))?;
-        if !fs::metadata(&target).is_ok_and(|about| about.file_type().is_char_device()) {
+        let is_port = |about: Metadata| about.file_type().is_char_device() && is_terminal(about.rdev());
+        if !fs::metadata(&target).is_ok_and(is_port) {
             return Err(no_port(Errno::ENOTTY));
         }
         let name = target.file_name().unwrap_or_default().to_string_lossy();
@@ -127,6 +128,22 @@ pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
         Ok(target)
     };
     found().map_err(|trouble| trouble.of(path.display()))
+}
+
+/// Whether one of the kernel's drivers of terminals and serial ports has this device.
+fn is_terminal(device: u64) -> bool {
+    // Without this file only opening shows it.
+    let Ok(drivers) = fs::read_to_string("/proc/tty/drivers") else { return true };
+    drivers.lines().any(|driver| has_device(driver, major(device), minor(device)))
+}
+
+/// A driver's line ends with its major number, its minor numbers such as `64-95`, and its type (fs/proc/proc_tty.c).
+fn has_device(driver: &str, major: u64, minor: u64) -> bool {
+    let mut words = driver.split_whitespace().rev().skip(1);
+    let (Some(minors), Some(its_major)) = (words.next(), words.next()) else { return false };
+    let (first, last) = minors.split_once('-').unwrap_or((minors, minors));
+    let number = |text: &str| text.parse::<u64>().ok();
+    number(its_major) == Some(major) && number(first) <= Some(minor) && Some(minor) <= number(last)
 }
 
 /// Opens a port as the line to a host, at this rate in baud. Without one it keeps its rate.
@@ -319,6 +336,28 @@ mod tests {
         let uart = Uart { name, device: (0, 0), links: vec![], is_console: false };
         let port = Port::open(Path::new("/dev"), &uart, 40_000);
         (other_end, uart, port)
+    }
+
+    #[test]
+    fn a_port_is_a_device_of_a_driver_of_terminals() {
+        for (line, device, is_its) in [
+            ("serial               /dev/ttyS       4 64-95 serial", (4, 64), true),
+            ("serial               /dev/ttyS       4 64-95 serial", (4, 95), true),
+            ("serial               /dev/ttyS       4 64-95 serial", (4, 96), false),
+            ("serial               /dev/ttyS       4 64-95 serial", (4, 63), false),
+            ("serial               /dev/ttyS       4 64-95 serial", (5, 64), false),
+            ("serial               /dev/ttyS       4      64 serial", (4, 64), true),
+            ("serial               /dev/ttyS       4      64 serial", (4, 65), false),
+            ("pty_slave            /dev/pts      136 0-1048575 pty:slave", (136, 7), true),
+            ("", (0, 0), false),
+            ("a b c d", (0, 0), false),
+        ] {
+            assert_eq!(has_device(line, device.0, device.1), is_its, "{line} {device:?}");
+        }
+        for other in ["/dev/null", "/dev/zero"] {
+            let told = find_line(Path::new(other)).unwrap_err().to_string();
+            assert!(told.starts_with(&format!("{other}: it is no serial port that works")), "{told}");
+        }
     }
 
     const SOON: Duration = Duration::from_millis(20);

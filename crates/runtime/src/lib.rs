@@ -63,7 +63,7 @@ pub use transport::can::{CanbusUuid, can_open, uuid as can_uuid};
 pub use transport::place::Place;
 pub use transport::pty::Access;
 pub use transport::served::{Served, served};
-pub use transport::stdio::give_back;
+pub use transport::stdio::{can_use as stdio_can_use, give_back};
 pub use transport::terminal_group::{CLOSED, TerminalGroup};
 pub use trouble::started;
 

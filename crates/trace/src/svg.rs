@@ -157,7 +157,8 @@ fn rows(history: &History<'_>, window: &Window) -> Vec<Row> {
         row(&history.pin(output.pin), color, output.highs, false)
     }));
     if left_out > 0 {
-        rows.push(row(&format!("(and {left_out} outputs)"), OTHER, Vec::new(), false));
+        let plural = if left_out == 1 { "" } else { "s" };
+        rows.push(row(&format!("(and {left_out} output{plural})"), OTHER, Vec::new(), false));
     }
     let busy = |event: &Event| matches!(event, Event::ErrandBegan { .. } | Event::ErrandEnded { .. });
     let buses = history.lanes.iter().filter(|lane| lane.deeds.iter().any(|deed| busy(&deed.event)));

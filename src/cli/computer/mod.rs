@@ -274,10 +274,10 @@ pub(super) mod tests {
             Computer { caller: Some(uid), ..self.computer() }
         }
 
-        pub(in crate::cli) fn put(&self, path: &str, text: &str) {
+        pub(in crate::cli) fn put(&self, path: &str, content: impl AsRef<[u8]>) {
             let path = self.0.path().join(path);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
-            fs::write(path, text).unwrap();
+            fs::write(path, content).unwrap();
         }
 
         pub(in crate::cli) fn mode(&self, path: &str, mode: u32) {

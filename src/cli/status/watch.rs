@@ -159,16 +159,18 @@ impl View {
         .min(lowest);
     }
 
-    /// The visible ones of a page's lines, and the text below them.
-    fn of<'a>(&mut self, lines: &'a [String], ends: &str) -> (&'a [String], String) {
+    /// The visible ones of a page's lines, and the text below them, for this many columns.
+    fn of<'a>(&mut self, lines: &'a [String], ends: &str, columns: usize) -> (&'a [String], String) {
         let count = lines.len();
         self.scroll(Scroll::Lines(0), count);
         let last = count.min(self.above + self.room);
         let shown = &lines[self.above..last];
-        let foot = match count > self.room {
-            true => format!("lines {} to {last} of {count}: arrows and page keys show others; {ends}", self.above + 1),
-            false => ends.to_owned(),
+        let place = format!("lines {} to {last} of {count}", self.above + 1);
+        let feet = match count > self.room {
+            true => vec![format!("{place}: arrows and page keys show others; {ends}"), format!("{place}; {ends}")],
+            false => vec![],
         };
+        let foot = feet.into_iter().find(|foot| foot.chars().count() <= columns).unwrap_or_else(|| ends.to_owned());
         (shown, foot)
     }
 }
@@ -226,7 +228,7 @@ impl Screen {
         self.view.room = size.rows.saturating_sub(1);
         let ends = if self.terminal.has_keys() { "q ends" } else { "Ctrl-C ends" };
         let lines = wrapped(&self.page, size.columns);
-        let (lines, foot) = self.view.of(&lines, ends);
+        let (lines, foot) = self.view.of(&lines, ends, size.columns);
         let lines: String = lines.iter().map(|line| format!("{line}{ERASE_LINE}\r\n")).collect();
         draw(&format!("{}{lines}{ERASE_BELOW}{foot}", to_row(1)))
     }
@@ -252,7 +254,7 @@ mod tests {
         let mut view = View { above: 0, room: 23 };
         let mut seen = |scroll: Scroll| {
             view.scroll(scroll, 40);
-            let (lines, foot) = view.of(&page, "q ends");
+            let (lines, foot) = view.of(&page, "q ends", 80);
             assert_eq!(lines.len(), 23);
             assert!(foot.chars().count() < 80 && foot.ends_with("; q ends"), "{foot}");
             let (first, last) = (lines[0].to_owned(), lines[22].to_owned());
@@ -273,10 +275,20 @@ mod tests {
         }
         // A page that has become shorter is shown whole, or so that its last line is the last one shown.
         let mut view = View { above: 17, room: 23 };
-        assert_eq!(view.of(&lines(25), "q ends").0[0], "line 3");
-        assert_eq!(view.of(&lines(2), "q ends"), (&lines(2)[..], "q ends".to_owned()));
-        assert_eq!(View::default().of(&lines(1), "q ends").0.len(), 0, "there is no room");
+        assert_eq!(view.of(&lines(25), "q ends", 80).0[0], "line 3");
+        assert_eq!(view.of(&lines(2), "q ends", 80), (&lines(2)[..], "q ends".to_owned()));
+        assert_eq!(View::default().of(&lines(1), "q ends", 80).0.len(), 0, "there is no room");
     }
+
+    #[test]
+    fn the_text_below_a_page_fits_a_narrow_terminal() {
+        let page: Vec<String> = (1..=40).map(|n| format!("line {n}")).collect();
+        let foot = |columns| View { above: 0, room: 23 }.of(&page, "q ends", columns).1;
+        assert_eq!(foot(61), "lines 1 to 23 of 40: arrows and page keys show others; q ends");
+        assert_eq!(foot(60), "lines 1 to 23 of 40; q ends");
+        assert_eq!(foot(20), "q ends");
+    }
+
     #[test]
     fn a_long_line_goes_on_below_its_text() {
         let page =

@@ -522,7 +522,14 @@ mod tests {
             self.0.store(self.1, value);
         }
 
-        fn wait() {}
+        fn wait() {
+            WAITS.set(WAITS.get() + 1);
+        }
+    }
+
+    thread_local! {
+        /// How often this thread has waited until its stores and loads had reached their device.
+        static WAITS: Cell<u32> = const { Cell::new(0) };
     }
 
     impl Model {
@@ -759,7 +766,9 @@ mod tests {
             assert_eq!(registers.is_posted(), read_back.is_some());
             registers.write(true);
             model.last_load.store(0, SeqCst);
+            let waits = WAITS.get();
             registers.flush();
+            assert_eq!(WAITS.get(), waits + 1, "a barrier is after the store and the load");
             assert_eq!(model.last_load.load(SeqCst), read_back.unwrap_or(0), "{layout:?} {line}");
         }
     }

@@ -108,11 +108,7 @@ impl Stdio {
     ///
     /// They are the terminal that shows the log, or the kernel refuses them.
     pub(crate) fn open() -> Result<Stdio, Trouble> {
-        if shows_log(io::stdin()) || shows_log(io::stdout()) {
-            return Err(Trouble::new("this terminal shows the log, and a host's bytes are no text")
-                .of("--link stdio")
-                .remedy("let socat or ssh start Pinion so, or leave out --link for a host on this computer"));
-        }
+        can_use()?;
         let lent = Lent::take(&[])?;
         let opened = || -> io::Result<Stdio> {
             Ok(Stdio {
@@ -139,6 +135,20 @@ impl Stdio {
         }
         Ok(())
     }
+}
+
+/// Whether standard input and output may carry a host.
+///
+/// # Errors
+///
+/// They are a person's terminal.
+pub fn can_use() -> Result<(), Trouble> {
+    if shows_log(io::stdin()) || shows_log(io::stdout()) {
+        return Err(Trouble::new("this terminal shows the log, and a host's bytes are no text")
+            .of("--link stdio")
+            .remedy("let socat or ssh start Pinion so, or leave out --link for a host on this computer"));
+    }
+    Ok(())
 }
 
 /// Whether this is a person's terminal. A program may use a terminal too (the option `pty` of socat), but its log goes

@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn the_second_worker_lowers_the_clock_if_the_first_is_interrupted() {
         for interrupted in [0, 7, 24] {
-            let (mut shift, mut watcher, chip) = workers(Some(interrupted), 1000);
+            let (mut shift, mut watcher, chip) = workers(Some(interrupted), 10_000);
             let shifted = thread::scope(|scope| {
                 scope.spawn(move || watcher.run().unwrap());
                 shift.run().unwrap()
@@ -321,6 +321,36 @@ mod tests {
             assert_eq!(chip.pulses.load(Ordering::SeqCst), u32::from(PULSES));
             assert_eq!(chip.falls.load(Ordering::SeqCst), u32::from(PULSES), "it is ended once");
         }
+    }
+
+    /// A clock with steps of 2 ms.
+    struct Coarse;
+
+    impl TimeSource for Coarse {
+        fn now(&self) -> Clock {
+            Clock::EPOCH
+        }
+
+        fn instant_of(&self, _: Duration) -> Clock {
+            Clock::EPOCH
+        }
+
+        fn duration_of(&self, _: Clock) -> Duration {
+            Duration::ZERO
+        }
+
+        fn step_ns(&self) -> u32 {
+            2_000_000
+        }
+    }
+
+    #[test]
+    fn a_pulse_is_surely_long_enough_on_a_coarse_clock() {
+        let (mut shift, ..) = workers(None, 1);
+        shift.time = Arc::new(Coarse);
+        let began = Instant::now();
+        shift.wait();
+        assert!(began.elapsed() >= Duration::from_nanos(2_000_200), "200 ns may be none on this clock");
     }
 
     #[test]

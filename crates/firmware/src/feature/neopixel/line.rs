@@ -361,13 +361,16 @@ mod tests {
             }
         }
         assert!(sent > 500, "{sent} of 1080 frames");
-        let limits = |step| {
+        let limits = |step, bit_max_us| {
             let clock = Stepped { real_ns: AtomicU64::new(0), step };
-            Limits::of(&clock, Ticks::from_us(4)).map(|limits| (limits.short, limits.short_max))
+            let limits = Limits::of(&clock, Ticks::from_us(bit_max_us))?;
+            let Limits { short, short_max, long, low, bit_max } = limits;
+            Some([short, short_max, long, low, bit_max].map(|limit| limit.0))
         };
-        assert_eq!(limits(FINE), Some((Ticks(12), Ticks(24))));
-        assert_eq!(limits(COARSE), Some((Ticks(15), Ticks(21))));
-        assert_eq!(limits(64 * 150), None);
+        assert_eq!(limits(FINE, 4), Some([12, 24, 40, 11, 199]));
+        assert_eq!(limits(COARSE, 4), Some([15, 21, 43, 14, 196]));
+        assert_eq!(limits(COARSE, 100), Some([15, 21, 43, 14, 246]), "whatever the host allows");
+        assert_eq!(limits(64 * 150, 4), None);
     }
 
     #[test]
