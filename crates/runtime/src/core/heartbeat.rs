@@ -126,7 +126,7 @@ impl Heartbeat {
         self.heart().set_pending(subject, stamp(now));
     }
 
-    /// Every output is at its shutdown value. This is a sign of life at `now`. Only the core calls this.
+    /// Every output is at its shutdown value. This is a beat at `now`. Only the core calls this.
     pub(crate) fn clear_pending(&self, now: Clock) {
         self.heart().clear_pending(stamp(now));
     }
@@ -159,7 +159,7 @@ impl Heartbeat {
         elapsed(beat_at, now) >= silence_max
     }
 
-    /// For the log: the fault of a program that gave no sign of life.
+    /// For the log: the fault of a program without a heartbeat.
     pub(crate) fn diagnosis(&self) -> String {
         let (silence_max, ms) = (self.heart().listen().silence_max_ms, self.listen().0.as_millis());
         match silence_max {
@@ -226,7 +226,7 @@ impl Drop for JobClock {
 /// Longest oversleep that counts as listening. After a longer one, only this much of the sleep counts.
 const OVERSLEPT: Duration = Duration::from_millis(100);
 
-/// How long a sign of life is missing. Silence counts only while the listener itself was awake. Both processes may
+/// How long a heartbeat is missing. Silence counts only while the listener itself was awake. Both processes may
 /// stand still together, as in a frozen control group. Then neither one believes that the other hangs.
 struct Silence {
     /// The last sign that was heard.
@@ -325,7 +325,7 @@ fn boottime() -> Duration {
     clock_gettime(ClockId::CLOCK_BOOTTIME).map_or(Duration::ZERO, Duration::from)
 }
 
-/// The program's monitor. It listens to the guardian's sign of life while the guardian holds outputs.
+/// The program's monitor. It listens to the guardian's heartbeat while the guardian holds outputs.
 pub(crate) struct GuardianMonitor {
     heartbeat: Heartbeat,
     silence: Option<Silence>,

@@ -256,7 +256,7 @@ impl Watcher {
                 match self.take_message() {
                     Incoming::Message if self.held.is_empty() => monitor = None,
                     Incoming::Message => {
-                        drop(monitor.get_or_insert_with(|| HeartbeatMonitor::new(self.heartbeat, self.heartbeat.now())))
+                        monitor.get_or_insert_with(|| HeartbeatMonitor::new(self.heartbeat, self.heartbeat.now()));
                     }
                     Incoming::Goodbye => return,
                     Incoming::Closed => break Cause::Died,
@@ -362,7 +362,7 @@ impl Watcher {
         // If nobody reads the log, writing to it blocks, and this process would keep the lines in use forever. Then the
         // alarm ends it (SIGALRM).
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
-        let of_crew = rescue.wait(TRY_FOR, |outcome| {
+        let of_threads = rescue.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
             error!("guardian: after {seconds} s still not at its shutdown value: {}", outcome.complaint());
         });
@@ -372,7 +372,7 @@ impl Watcher {
             Cause::Died => format!("Pinion (process {pid}) died: was it killed, or did it crash?"),
             Cause::Hangs => format!("{diagnosis}: Pinion (process {pid}) is killed"),
         };
-        let outcomes: Vec<_> = driven.iter().map(|output| &output.outcome).chain(&of_crew).collect();
+        let outcomes: Vec<_> = driven.iter().map(|output| &output.outcome).chain(&of_threads).collect();
         error!("guardian: {what}; {}", summary(&outcomes));
     }
 }

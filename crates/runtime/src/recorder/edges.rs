@@ -24,18 +24,18 @@ use super::locked;
 /// from the board itself.
 pub(super) struct EdgeBoard {
     pub(super) board: Box<dyn Board>,
-    pub(super) trace_writer: Arc<EdgeTape>,
+    pub(super) trace_writer: Arc<EdgeWriter>,
     /// Where the names of the lines are noted.
     pub(super) names: Arc<Mutex<Names>>,
 }
 
 /// Where the edges are recorded. Core and workers write lines.
-pub(super) struct EdgeTape {
+pub(super) struct EdgeWriter {
     pub(super) writer: Mutex<Writer>,
     pub(super) clock: Monotonic,
 }
 
-impl EdgeTape {
+impl EdgeWriter {
     /// No thread waits for another one here. If two change lines at the same time, one edge is missing.
     fn record(&self, pin: u32, level: bool) {
         if let Ok(mut writer) = self.writer.try_lock() {
@@ -50,7 +50,7 @@ const UNKNOWN: u8 = 2;
 /// A line that records its edges.
 struct EdgeLine {
     line: Arc<dyn Line>,
-    trace_writer: Arc<EdgeTape>,
+    trace_writer: Arc<EdgeWriter>,
     pin: u32,
     level: AtomicU8,
 }
@@ -196,7 +196,7 @@ mod tests {
     use pinion_testbench::rig::{Rig, hex};
 
     fn edge_board(recording: &Recording, bench: Bench, names: &Arc<Mutex<Names>>) -> EdgeBoard {
-        let trace_writer = EdgeTape { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
+        let trace_writer = EdgeWriter { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
         EdgeBoard { board: Box::new(FakeBoard(bench)), trace_writer: Arc::new(trace_writer), names: names.clone() }
     }
 

@@ -50,7 +50,7 @@ use crate::status::{ClientLimits, Place, serve_on};
 use crate::transport::LinkName;
 
 use computer::Computer;
-use edges::{EdgeBoard, EdgeTape};
+use edges::{EdgeBoard, EdgeWriter};
 use memory::Memory;
 use pace::Pace;
 use trace_writer::News;
@@ -298,7 +298,7 @@ impl Recorder {
     /// The same board, which also records the edges of its outputs.
     pub(super) fn with_edges(&self, board: Box<dyn Board>) -> Box<dyn Board> {
         let Some(writer) = self.recording.memory.edges() else { return board };
-        let trace_writer = Arc::new(EdgeTape { writer: Mutex::new(writer), clock: self.recording.clock });
+        let trace_writer = Arc::new(EdgeWriter { writer: Mutex::new(writer), clock: self.recording.clock });
         Box::new(EdgeBoard { board, trace_writer, names: self.names.clone() })
     }
 

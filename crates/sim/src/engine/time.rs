@@ -16,7 +16,7 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
 }
 
 /// Longest delay of a timer or a step. A simulated motor follows at any pace. Most computers that try the printer have
-/// no real time. If they are busy, they are late by a tenth of a second now and then. After 550 ms without a sign of life
+/// no real time. If they are busy, they are late by a tenth of a second now and then. After 550 ms without a heartbeat
 /// the guardian ends the program.
 pub(crate) const LATE_LIMIT: Ticks = Ticks::from_ms(400);
 

@@ -42,8 +42,8 @@ pub(super) struct Account {
     pub(super) lost: Option<i64>,
 }
 
-/// An errand of a worker.
-pub(super) struct Errand<'a> {
+/// A job of a worker.
+pub(super) struct Job<'a> {
     pub(super) bus: &'a str,
     pub(super) oid: Option<u8>,
     pub(super) span: Span,
@@ -75,11 +75,34 @@ pub(super) struct Stop {
     pub(super) due: Option<i64>,
 }
 
+/// The thread of an event.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Thread<'a> {
+    Core,
+    Link,
+    Sampler,
+    Guardian,
+    /// The worker of a bus, by the name of the bus; the edges, too.
+    Other(&'a str),
+}
+
+impl Thread<'_> {
+    fn of(name: &str) -> Thread<'_> {
+        match name {
+            "core" => Thread::Core,
+            "link" => Thread::Link,
+            "sampler" => Thread::Sampler,
+            "guardian" => Thread::Guardian,
+            other => Thread::Other(other),
+        }
+    }
+}
+
 /// All events of a trace in their order.
 pub(super) struct Record<'a> {
     pub(super) trace: &'a Trace,
     pub(super) stop: Stop,
-    events: Vec<(i64, &'a str, Event)>,
+    events: Vec<(i64, Thread<'a>, Event)>,
     /// When the core did something. It may have done more in between.
     busy: Vec<Span>,
 }
@@ -95,14 +118,15 @@ impl<'a> Record<'a> {
         let zero = last.map_or(trace.ended_at(), |(at, _)| at);
         let since = |at: Clock| at.since(zero).clamp(-FAR, FAR);
         // The clock may be so far off that its order is lost.
-        let mut events: Vec<_> = all.iter().map(|(at, thread, event)| (since(*at), *thread, *event)).collect();
+        let mut events: Vec<_> =
+            all.iter().map(|(at, thread, event)| (since(*at), Thread::of(thread), *event)).collect();
         events.sort_by_key(|(at, ..)| *at);
         let mut stop = Stop::default();
         if let Some((_, Event::Stopped { block })) = last {
             stop.block = Some(block);
             stop.due = events
                 .iter()
-                .filter(|(at, thread, _)| *at >= 0 && *thread == "core")
+                .filter(|(at, thread, _)| *at >= 0 && *thread == Thread::Core)
                 .find_map(|(.., event)| if let Event::Due(due) = event { Some(since(*due)) } else { None });
         }
         let busy = busy(trace, since);
@@ -110,18 +134,18 @@ impl<'a> Record<'a> {
     }
 
     /// The events of a thread.
-    fn thread(&self, name: &str) -> impl DoubleEndedIterator<Item = (i64, Event)> {
-        self.events.iter().filter(move |(_, thread, _)| *thread == name).map(|(at, _, event)| (*at, *event))
+    fn thread(&self, thread: Thread<'a>) -> impl DoubleEndedIterator<Item = (i64, Event)> {
+        self.events.iter().filter(move |(_, of, _)| *of == thread).map(|(at, _, event)| (*at, *event))
     }
 
     /// The events of a thread within a span.
-    fn within(&self, name: &str, span: Span) -> impl DoubleEndedIterator<Item = (i64, Event)> {
-        self.thread(name).filter(move |(at, _)| (span.0..=span.1).contains(at))
+    fn within(&self, thread: Thread<'a>, span: Span) -> impl DoubleEndedIterator<Item = (i64, Event)> {
+        self.thread(thread).filter(move |(at, _)| (span.0..=span.1).contains(at))
     }
 
     /// When the link read a block before the stop.
     pub(super) fn arrived(&self, block: u32) -> Option<Arrival> {
-        self.within("link", (-FAR, 0)).find_map(|(at, event)| match event {
+        self.within(Thread::Link, (-FAR, 0)).find_map(|(at, event)| match event {
             Event::BlockIn(number) if number.wrapping_sub(block) as i32 >= 0 => {
                 Some(Arrival { at, is_exact: number == block })
             }
@@ -132,53 +156,54 @@ impl<'a> Record<'a> {
     /// When the link read the first block behind a block, while the core had not begun it.
     pub(super) fn pending(&self) -> Option<i64> {
         let next = self.stop.block?.wrapping_add(1);
-        let read = self.thread("link").find(|(_, event)| *event == Event::BlockIn(next));
+        let read = self.thread(Thread::Link).find(|(_, event)| *event == Event::BlockIn(next));
         read.map(|(at, _)| at).filter(|at| *at < 0)
     }
 
     /// When the link last read a block for the core before the stop.
     pub(super) fn last_block(&self) -> Option<i64> {
-        let mut blocks = self.within("link", (-FAR, 0));
+        let mut blocks = self.within(Thread::Link, (-FAR, 0));
         blocks.rfind(|(_, event)| matches!(event, Event::BlockIn(_))).map(|(at, _)| at)
     }
 
     /// When something came from the host or its computer last before a time.
     pub(super) fn last_heard(&self, until: i64) -> Option<i64> {
-        let mut heard = self.within("link", (-FAR, until - 1));
+        let mut heard = self.within(Thread::Link, (-FAR, until - 1));
         heard.rfind(|(_, event)| is_heard(event)).map(|(at, _)| at)
     }
 
     /// Whether the host's computer gave a sign of life in a span, for a host that was silent.
     pub(super) fn was_alive(&self, span: Span) -> bool {
-        self.within("link", span).any(|(_, event)| event == Event::Alive)
+        self.within(Thread::Link, span).any(|(_, event)| event == Event::Alive)
     }
 
     /// How many blocks the host sent again within a span, and whether it asked for something that the link answers.
     pub(super) fn signs_of_host(&self, span: Span) -> (usize, bool) {
-        let events = || self.within("link", span).map(|(_, event)| event);
+        let events = || self.within(Thread::Link, span).map(|(_, event)| event);
         let repeated = events().filter(|event| *event == Event::Refused(Refusal::Repeated)).count();
         (repeated, events().any(|event| matches!(event, Event::Answered { .. })))
     }
 
     /// Whether garbage came from the host in a span.
     pub(super) fn has_garbage(&self, span: Span) -> bool {
-        self.within("link", span).any(|(_, event)| event == Event::Refused(Refusal::Garbage))
+        self.within(Thread::Link, span).any(|(_, event)| event == Event::Refused(Refusal::Garbage))
     }
 
     /// When the last host was gone, if none has come since.
     pub(super) fn host_gone(&self) -> Option<i64> {
-        let mut hosts = self.thread("link").filter(|(_, event)| matches!(event, Event::HostCame | Event::HostGone));
+        let mut hosts =
+            self.thread(Thread::Link).filter(|(_, event)| matches!(event, Event::HostCame | Event::HostGone));
         hosts.rfind(|(at, _)| *at <= 0).filter(|(_, event)| *event == Event::HostGone).map(|(at, _)| at)
     }
 
     /// When the core first had no room for the host's blocks in a span.
     pub(super) fn full(&self, span: Span) -> Option<i64> {
-        self.within("link", span).find(|(_, event)| *event == Event::Full).map(|(at, _)| at)
+        self.within(Thread::Link, span).find(|(_, event)| *event == Event::Full).map(|(at, _)| at)
     }
 
     /// The name of the command that the core ran last.
     pub(super) fn last_command(&self) -> Option<&'a str> {
-        let mut commands = self.thread("core").filter(|(at, _)| *at <= 0);
+        let mut commands = self.thread(Thread::Core).filter(|(at, _)| *at <= 0);
         let id = commands.rfind(|(_, event)| matches!(event, Event::Command { .. }));
         let Some((_, Event::Command { id, .. })) = id else { return None };
         self.trace.head.names.commands.get(&id).map(String::as_str)
@@ -198,7 +223,7 @@ impl<'a> Record<'a> {
     pub(super) fn held(&self, span: Span) -> i64 {
         let (mut held, mut since) = (0, None);
         let mut is_first = true;
-        for (at, event) in self.thread("core") {
+        for (at, event) in self.thread(Thread::Core) {
             match event {
                 Event::Held => since = Some(at),
                 // The record does not reach back to its beginning.
@@ -215,41 +240,42 @@ impl<'a> Record<'a> {
 
     /// Whether commands no longer had to wait for a bus within a span.
     pub(super) fn was_released(&self, span: Span) -> bool {
-        self.within("core", span).any(|(_, event)| event == Event::Released)
+        self.within(Thread::Core, span).any(|(_, event)| event == Event::Released)
     }
 
-    /// All errands.
-    fn errands(&self) -> Vec<Errand<'a>> {
-        let mut open: Vec<Errand> = Vec::new();
-        let mut errands = Vec::new();
-        for (at, bus, event) in &self.events {
+    /// All jobs.
+    fn jobs(&self) -> Vec<Job<'a>> {
+        let mut open: Vec<Job> = Vec::new();
+        let mut jobs = Vec::new();
+        for (at, thread, event) in &self.events {
+            let Thread::Other(bus) = thread else { continue };
             match *event {
                 Event::ErrandBegan { oid, .. } => {
-                    open.retain(|errand| errand.bus != *bus);
-                    open.push(Errand { bus, oid, span: (*at, FAR), is_open: true });
+                    open.retain(|job| job.bus != *bus);
+                    open.push(Job { bus, oid, span: (*at, FAR), is_open: true });
                 }
                 Event::ErrandEnded { oid, took } => {
-                    open.retain(|errand| errand.bus != *bus);
-                    errands.push(Errand { bus, oid, span: (at - i64::from(took.0), *at), is_open: false });
+                    open.retain(|job| job.bus != *bus);
+                    jobs.push(Job { bus, oid, span: (at - i64::from(took.0), *at), is_open: false });
                 }
                 _ => {}
             }
         }
-        errands.extend(open);
-        errands
+        jobs.extend(open);
+        jobs
     }
 
-    /// The errand that took the most of a span.
-    pub(super) fn longest_errand(&self, span: Span) -> Option<Errand<'a>> {
-        let mut errands = self.errands();
-        errands.retain(|errand| common(errand.span, span) > 0);
-        errands.into_iter().max_by_key(|errand| common(errand.span, span))
+    /// The job that took the most of a span.
+    pub(super) fn longest_job(&self, span: Span) -> Option<Job<'a>> {
+        let mut jobs = self.jobs();
+        jobs.retain(|job| common(job.span, span) > 0);
+        jobs.into_iter().max_by_key(|job| common(job.span, span))
     }
 
-    /// The errand that has been under way for the longest time.
-    pub(super) fn hanging(&self) -> Option<Errand<'a>> {
-        let open = self.errands().into_iter().filter(|errand| errand.is_open && errand.span.0 < 0);
-        open.min_by_key(|errand| errand.span.0)
+    /// The job that has been under way for the longest time.
+    pub(super) fn hanging(&self) -> Option<Job<'a>> {
+        let open = self.jobs().into_iter().filter(|job| job.is_open && job.span.0 < 0);
+        open.min_by_key(|job| job.span.0)
     }
 
     /// The kernel's account of a thread in the samples that cover a span. `None` if they cover less than half of it.
@@ -257,7 +283,7 @@ impl<'a> Record<'a> {
         let (mut before, mut covered) = (None, 0);
         let (mut ran_sum, mut waited_sum) = (0, 0);
         let mut samples: Option<Span> = None;
-        for (at, event) in self.thread("sampler") {
+        for (at, event) in self.thread(Thread::Sampler) {
             let Event::Processor { thread, ran, waited } = event else { continue };
             if thread != watched {
                 continue;
@@ -281,8 +307,8 @@ impl<'a> Record<'a> {
     fn slept(&self, span: Span) -> Option<i64> {
         let is_short_lived =
             |event: &Event| matches!(event, Event::Woke { .. } | Event::Block(_) | Event::Command { .. });
-        self.thread("core").find(|(_, event)| is_short_lived(event)).filter(|(at, _)| *at <= span.0)?;
-        let sleeps = self.thread("core").filter_map(|(at, event)| match event {
+        self.thread(Thread::Core).find(|(_, event)| is_short_lived(event)).filter(|(at, _)| *at <= span.0)?;
+        let sleeps = self.thread(Thread::Core).filter_map(|(at, event)| match event {
             Event::Woke { slept, late } => Some((at - i64::from(slept.0), at - i64::from(late.0))),
             _ => None,
         });
@@ -297,7 +323,7 @@ impl<'a> Record<'a> {
         // What was taken, and of how long a time, in these samples and in the others.
         let (mut here, mut elsewhere) = ((0, 0), (0, 0));
         let (mut before, mut stolen) = (None, 0);
-        for (at, event) in self.thread("sampler") {
+        for (at, event) in self.thread(Thread::Sampler) {
             match event {
                 Event::Stolen(ticks) => stolen += i64::from(ticks.0),
                 Event::Looked { all: true, .. } => {
@@ -331,27 +357,29 @@ impl<'a> Record<'a> {
     pub(super) fn others_went_on(&self, span: Span) -> bool {
         let edge = (span.1 - span.0) / 8;
         let inner = span.0 + edge..span.1 - edge;
-        self.events.iter().any(|(at, thread, _)| inner.contains(at) && !["core", "guardian"].contains(thread))
+        self.events
+            .iter()
+            .any(|(at, thread, _)| inner.contains(at) && !matches!(thread, Thread::Core | Thread::Guardian))
     }
 
     /// Whether the sampler missed its time in a span, because it did not run either. It says when it looks again.
     pub(super) fn sampler_missed(&self, span: Span) -> bool {
         // It may have been the last one to stop.
         let start = span.0 + (span.1 - span.0) / 8;
-        let due = self.within("sampler", (-FAR, start)).rev().find_map(|(at, event)| match event {
+        let due = self.within(Thread::Sampler, (-FAR, start)).rev().find_map(|(at, event)| match event {
             Event::Looked { again, .. } => Some(at + i64::from(again.0)),
             _ => None,
         });
         due.is_some_and(|due| span.1 - due > LOOK_LATE)
-            && self.within("sampler", (start + 1, span.1 - 1)).next().is_none()
+            && self.within(Thread::Sampler, (start + 1, span.1 - 1)).next().is_none()
     }
 
     /// Whether the guardian went on in a span. `None` if the span is too short to tell, or nothing of the guardian is
     /// recorded.
     pub(super) fn guardian_went_on(&self, span: Span) -> Option<bool> {
-        self.thread("guardian").next()?;
+        self.thread(Thread::Guardian).next()?;
         let edge = (span.1 - span.0) / 8;
-        match self.within("guardian", (span.0 + edge, span.1 - edge)).next() {
+        match self.within(Thread::Guardian, (span.0 + edge, span.1 - edge)).next() {
             Some(_) => Some(true),
             None => (span.1 - span.0 > LISTENS).then_some(false),
         }
@@ -359,7 +387,7 @@ impl<'a> Record<'a> {
 
     /// How late the core woke at most within a span, as the kernel wakes a thread.
     pub(super) fn latest_wake(&self, span: Span) -> i64 {
-        let late = self.within("core", span).map(|(_, event)| match event {
+        let late = self.within(Thread::Core, span).map(|(_, event)| match event {
             Event::Woke { late, .. } => i64::from(late.0),
             _ => 0,
         });
@@ -368,18 +396,18 @@ impl<'a> Record<'a> {
 
     /// Whether the core slept within a span.
     pub(super) fn did_sleep(&self, span: Span) -> bool {
-        self.within("core", span).any(|(_, event)| matches!(event, Event::Woke { .. }))
+        self.within(Thread::Core, span).any(|(_, event)| matches!(event, Event::Woke { .. }))
     }
 
     /// Number of the core's events in a span.
     pub(super) fn events_of_core(&self, span: Span) -> usize {
-        self.within("core", span).count()
+        self.within(Thread::Core, span).count()
     }
 
     /// The latest timer: when it ran, and how late. `None` if nothing of timers is recorded. `Late` alone tells its own
     /// time. `Pace` is about the time since the one before.
     pub(super) fn latest_timer(&self) -> Option<Span> {
-        let timers = self.within("core", (-RECENT, QUIET)).filter_map(|(at, event)| match event {
+        let timers = self.within(Thread::Core, (-RECENT, QUIET)).filter_map(|(at, event)| match event {
             Event::Late { late, .. } | Event::Pace { worst: late, .. } => Some((at, i64::from(late.0))),
             _ => None,
         });
@@ -388,16 +416,17 @@ impl<'a> Record<'a> {
 
     /// How late a timer was at most within a span, by its own time.
     pub(super) fn latest_within(&self, span: Span) -> i64 {
-        let late =
-            self.within("core", span).map(|(_, event)| if let Event::Late { late, .. } = event { late.0 } else { 0 });
+        let late = self
+            .within(Thread::Core, span)
+            .map(|(_, event)| if let Event::Late { late, .. } = event { late.0 } else { 0 });
         late.max().unwrap_or(0).into()
     }
 
     /// How the core was scheduled in a span.
     pub(super) fn scheduling(&self, span: Span) -> Scheduling {
         let classes = |(at, event)| if let Event::Scheduling { fifo } = event { Some((at, fifo)) } else { None };
-        let before = self.within("core", (-FAR, span.0)).rev().find_map(classes);
-        let mut classes = before.into_iter().chain(self.within("core", span).filter_map(classes));
+        let before = self.within(Thread::Core, (-FAR, span.0)).rev().find_map(classes);
+        let mut classes = before.into_iter().chain(self.within(Thread::Core, span).filter_map(classes));
         match classes.find(|(_, fifo)| !fifo) {
             None => Scheduling::RealTime,
             Some((since, _)) if span.1 - since < UNUSED => Scheduling::UsedUp,
@@ -408,16 +437,16 @@ impl<'a> Record<'a> {
     /// The fault of the computer's power supply or temperature in a span.
     pub(super) fn power_fault(&self, span: Span) -> Option<PowerFault> {
         let faults = |(_, event)| if let Event::Power(fault) = event { Some(fault) } else { None };
-        let before = self.within("sampler", (-FAR, span.0)).rev().find_map(faults);
-        let mut looks = self.within("sampler", (span.1, FAR));
+        let before = self.within(Thread::Sampler, (-FAR, span.0)).rev().find_map(faults);
+        let mut looks = self.within(Thread::Sampler, (span.1, FAR));
         let seen =
             looks.find(|(_, event)| matches!(event, Event::Looked { all: true, .. })).map_or(span.1, |(at, _)| at);
-        before.into_iter().chain(self.within("sampler", (span.0, seen)).filter_map(faults)).flatten().next()
+        before.into_iter().chain(self.within(Thread::Sampler, (span.0, seen)).filter_map(faults)).flatten().next()
     }
 
     /// The processors' frequency in a span, and the highest possible one, if it was less than half of that.
     pub(super) fn low_frequency(&self, span: Span) -> Option<(u16, u16)> {
-        let mut until = self.within("sampler", (-FAR, span.1)).rev();
+        let mut until = self.within(Thread::Sampler, (-FAR, span.1)).rev();
         let frequency = until.find_map(|(_, event)| match event {
             Event::Frequency { mhz, max_mhz } => Some((mhz, max_mhz)),
             _ => None,
