@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::fs::{self, File, Metadata, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read};
@@ -16,6 +17,7 @@ use nix::fcntl::OFlag;
 use nix::unistd::{AccessFlags, access};
 
 use pinion_linux::foreign;
+use pinion_linux::own_folder::below;
 
 const MIB: u64 = 1 << 20;
 /// How many names of a new file are tried.
@@ -47,11 +49,16 @@ pub fn read(path: &Path, mib_max: u64) -> io::Result<Vec<u8>> {
 }
 
 /// A file to write. There is none until it is written.
+///
+/// The file is reached below the descriptor of its folder. Whoever may rename files on the way to it, as everybody may
+/// in /tmp, could otherwise have another user replace a file elsewhere.
 pub struct Output {
     /// As the command line names it.
     path: PathBuf,
-    /// The same, without symbolic links.
-    place: PathBuf,
+    folder: File,
+    name: OsString,
+    /// The permissions of the file that it replaces.
+    mode: Option<u32>,
 }
 
 impl Output {
@@ -62,7 +69,7 @@ impl Output {
     ///
     /// One line with the file, the cause and the remedy.
     pub fn check(path: &Path, inputs: &[&Path]) -> Result<Output, String> {
-        let (place, there) = Output::find(path).map_err(|error| unwritable(path, &error))?;
+        let (output, there) = Output::find(path).map_err(|error| unwritable(path, &error))?;
         let is_there = |input: &&&Path| match (&there, fs::metadata(input)) {
             (Some(there), Ok(input)) => (there.dev(), there.ino()) == (input.dev(), input.ino()),
             _ => false,
@@ -71,19 +78,32 @@ impl Output {
             let input = input.display();
             return Err(format!("{} is the same file as {input}, which is read: name another file", path.display()));
         }
-        Ok(Output { path: path.to_owned(), place })
+        Ok(output)
     }
 
-    /// The place of the file, and what is there.
-    fn find(path: &Path) -> io::Result<(PathBuf, Option<Metadata>)> {
-        let (place, there) = match fs::metadata(path) {
-            Ok(there) if !there.is_file() => return Err(io::Error::other("it is no regular file")),
-            Ok(there) => (fs::canonicalize(path)?, Some(there)),
+    /// The file without the symbolic links that lead to it, and what is there.
+    fn find(path: &Path) -> io::Result<(Output, Option<Metadata>)> {
+        let place = |path: &Path, flags: OFlag| {
+            OpenOptions::new().read(true).custom_flags((flags | OFlag::O_PATH).bits()).open(path)
+        };
+        let (real, there) = match place(path, OFlag::empty()) {
+            Ok(file) => (fs::read_link(below(&file))?, Some(file.metadata()?)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => (path.to_owned(), None),
             Err(error) => return Err(error),
         };
-        access(folder(&place), AccessFlags::W_OK | AccessFlags::X_OK)?;
-        Ok((place, there))
+        if there.as_ref().is_some_and(|there| !there.is_file()) {
+            return Err(io::Error::other("it is no regular file"));
+        }
+        let folder = real.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let name = real.file_name().ok_or(io::ErrorKind::IsADirectory)?.to_owned();
+        let mode = there.as_ref().map(|there| there.mode() & 0o777);
+        let output = Output { path: path.to_owned(), folder: place(folder, OFlag::O_DIRECTORY)?, name, mode };
+        access(&below(&output.folder), AccessFlags::W_OK | AccessFlags::X_OK)?;
+        Ok((output, there))
+    }
+
+    fn at(&self, name: impl AsRef<Path>) -> PathBuf {
+        below(&self.folder).join(name)
     }
 
     /// Writes the file: beside its place, then over it. If it cannot replace what is there, it stays beside it.
@@ -93,22 +113,35 @@ impl Output {
     /// One line with the file, the cause and the remedy.
     pub fn write<T>(&self, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<T>) -> Result<T, String> {
         let failed = |error: io::Error| unwritable(&self.path, &error);
-        let (fresh, file) = beside(&self.place).map_err(failed)?;
+        let (name, file) = self.beside().map_err(failed)?;
+        let fresh = self.at(&name);
         let put = || {
             let mut out = BufWriter::new(file);
             let written = write(&mut out)?;
             let file = out.into_inner()?;
-            if let Ok(there) = fs::metadata(&self.place) {
-                file.set_permissions(Permissions::from_mode(there.mode() & 0o777))?;
+            if let Some(mode) = self.mode {
+                file.set_permissions(Permissions::from_mode(mode))?;
             }
             Ok(written)
         };
         let written = put().inspect_err(|_| drop(fs::remove_file(&fresh))).map_err(failed)?;
-        fs::rename(&fresh, &self.place).map_err(|error| {
-            let (place, fresh) = (self.path.display(), fresh.display());
-            format!("{place} cannot be replaced: {error}: take what is in {fresh}")
+        fs::rename(&fresh, self.at(&self.name)).map_err(|error| {
+            let place = self.path.display();
+            format!("{place} cannot be replaced: {error}: take what is in {name} beside it")
         })?;
         Ok(written)
+    }
+
+    /// A new file in the same folder, with its name. A program that was killed may have left some.
+    fn beside(&self) -> io::Result<(String, File)> {
+        let mut tries = 0;
+        loop {
+            let name = format!(".pinion.{}.{tries}", std::process::id());
+            match OpenOptions::new().write(true).create_new(true).open(self.at(&name)) {
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists && tries < TRIES => tries += 1,
+                opened => return opened.map(|file| (name, file)),
+            }
+        }
     }
 
     /// Makes the file now, empty, for what comes bit by bit.
@@ -118,31 +151,15 @@ impl Output {
     /// One line with the file, the cause and the remedy.
     pub fn make(&self) -> Result<File, String> {
         let mut options = OpenOptions::new();
-        options.write(true).create(true).truncate(true).custom_flags(OFlag::O_NONBLOCK.bits());
-        options.open(&self.place).map_err(|error| unwritable(&self.path, &error))
+        let flags = OFlag::O_NONBLOCK | OFlag::O_NOFOLLOW;
+        options.write(true).create(true).truncate(true).custom_flags(flags.bits());
+        options.open(self.at(&self.name)).map_err(|error| unwritable(&self.path, &error))
     }
 
     /// The file, as the command line names it.
     pub fn path(&self) -> impl Display {
         self.path.display()
     }
-}
-
-/// A new file in the same folder. A program that was killed may have left some.
-fn beside(place: &Path) -> io::Result<(PathBuf, File)> {
-    let mut tries = 0;
-    loop {
-        let fresh = folder(place).join(format!(".pinion.{}.{tries}", std::process::id()));
-        match OpenOptions::new().write(true).create_new(true).open(&fresh) {
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists && tries < TRIES => tries += 1,
-            opened => return opened.map(|file| (fresh, file)),
-        }
-    }
-}
-
-/// The folder of a file.
-fn folder(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 fn unwritable(path: &Path, error: &io::Error) -> String {
@@ -187,6 +204,31 @@ mod tests {
             assert!(error.contains(" is the same file as "), "{error}");
         }
         assert!(Output::check(&folder.path().join("b"), &[&path]).is_ok());
+    }
+
+    /// What another user may do in /tmp, and in a folder of their own, between the check and the write.
+    #[test]
+    fn a_file_that_was_checked_stays_where_it_was() {
+        let root = tempfile::tempdir().unwrap();
+        let [folder, moved, victim] = ["folder", "moved", "victim"].map(|name| root.path().join(name));
+        fs::create_dir(&folder).unwrap();
+        fs::create_dir(&victim).unwrap();
+        let path = folder.join("a");
+        let kept = victim.join("a");
+        for file in [&path, &kept] {
+            fs::write(file, "old").unwrap();
+        }
+        let output = Output::check(&path, &[]).unwrap();
+        // A link in the file's place.
+        fs::remove_file(&path).unwrap();
+        symlink(&kept, &path).unwrap();
+        assert!(output.make().is_err());
+        assert_eq!(fs::read(&kept).unwrap(), b"old");
+        // A link in the folder's place.
+        fs::rename(&folder, &moved).unwrap();
+        symlink(&victim, &folder).unwrap();
+        output.write(|out| out.write_all(b"new")).unwrap();
+        assert_eq!((fs::read(&kept).unwrap(), fs::read(moved.join("a")).unwrap()), (b"old".to_vec(), b"new".to_vec()));
     }
 
     #[test]

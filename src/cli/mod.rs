@@ -196,8 +196,10 @@ fn quietly<T>(work: impl FnOnce() -> T) -> T {
 
 /// Why a user may not ask a running Pinion by its link, which leads to this file.
 fn not_permitted(link: &Path, file: &Path) -> String {
-    // Any user can make a link in /tmp to any file, and the groups of other files open more than a terminal.
-    let is_other = |about: Metadata| !about.file_type().is_socket() && !is_pseudo_terminal(&about);
+    // Any user can make a link in /tmp to any file, and the groups of other files open more than a terminal. Pinion's
+    // own socket is no link.
+    let is_socket = file.symlink_metadata().is_ok_and(|about| about.file_type().is_socket());
+    let is_other = |about: Metadata| !is_socket && !is_pseudo_terminal(&about);
     let remedy = match Opener::of(file).command() {
         _ if file.metadata().is_ok_and(is_other) => "name the link of a Pinion".to_owned(),
         Some(command) => format!("\"{command}\" and log in anew, or use sudo"),
@@ -240,8 +242,12 @@ mod tests {
         for path in [&file, &socket] {
             std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o660)).unwrap();
         }
-        let told = not_permitted(Path::new("/tmp/klipper_host_mcu"), &file);
-        assert!(told.ends_with("may not be opened by this user: name the link of a Pinion"), "{told}");
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink(&socket, &link).unwrap();
+        for other in [&file, &link] {
+            let told = not_permitted(Path::new("/tmp/klipper_host_mcu"), other);
+            assert!(told.ends_with("may not be opened by this user: name the link of a Pinion"), "{told}");
+        }
         assert!(not_permitted(&socket, &socket).contains("use sudo"));
     }
 

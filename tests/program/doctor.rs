@@ -271,6 +271,21 @@ fn false_processes_of_another_user_change_no_advice() {
     assert_eq!(after.replace(&format!("  ok       {told}{remedy}"), ""), before);
 }
 
+/// The host may have processes of any name, too, in its own unit. It gets no more groups by that.
+#[test]
+fn a_false_pinion_of_the_host_changes_no_advice() {
+    let tree = Tree::printer();
+    tree.put("home/pi/printer.cfg", "[mcu host]\nserial: /tmp/klipper_host_mcu\n[tmc2209 a]\nuart_pin: host:ttyAMA0\n");
+    let before = tree.doctor();
+    tree.put("home/pi/pins.toml", "watchdog = true\n");
+    tree.process(5, "klipper", 54321, "", &["pinion", "run", "--config", "/home/pi/pins.toml"]);
+    let after = tree.doctor();
+    let told = "other users have processes with the names of a Pinion or a klippy, which do not count here: 5\n";
+    let remedy = "           -> if one of them is yours, have a service start it\n";
+    assert_eq!(after.replace(&format!("  ok       {told}{remedy}"), ""), before);
+    assert!(after.contains(told) && !after.contains("usermod"), "{after}");
+}
+
 #[test]
 fn a_name_in_the_configuration_that_leads_out_of_dev_opens_nothing() {
     let tree = Tree::printer();

@@ -15,9 +15,10 @@ use std::time::Instant;
 use nix::sys::signal::Signal;
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{FlowArg, tcflow};
+use pinion_testkit::here;
 use serde_json::{Value, json};
 
-use crate::process::{Pinion, WAIT_MAX, exists, output, pinion_path};
+use crate::process::{Pinion, WAIT_MAX, as_nobody, exists, output, pinion_path, program_in};
 use crate::terminal::AtTerminal;
 
 fn socket(pinion: &Pinion) -> PathBuf {
@@ -307,6 +308,29 @@ fn the_folder_is_the_one_that_takes_recordings() {
 }
 
 /// Other clients also ask, more than fit into the socket's queue.
+/// Any user can make such a link in /tmp, where the socket is if nobody has made a better place.
+#[test]
+fn a_link_to_another_socket_makes_nobody_a_member_of_its_group() {
+    if !here::is_root() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
+    let [other, link] = ["docker.sock", "pinion-mcu.sock"].map(|name| folder.path().join(name));
+    let _listener = UnixListener::bind(&other).unwrap();
+    // The group `disk`.
+    std::os::unix::fs::chown(&other, None, Some(6)).unwrap();
+    fs::set_permissions(&other, fs::Permissions::from_mode(0o660)).unwrap();
+    std::os::unix::fs::symlink(&other, &link).unwrap();
+    let mut status = Command::new(program_in(folder.path()));
+    let refused = as_nobody(status.args(["status", "--socket"]).arg(&link)).output().unwrap();
+    let log = String::from_utf8_lossy(&refused.stderr);
+    assert!(
+        log.contains("may not be opened by this user: name the link of a Pinion") && !log.contains("sudo"),
+        "{log}"
+    );
+}
+
 #[test]
 fn a_crowd_is_waited_for_and_then_named() {
     let folder = tempfile::tempdir().unwrap();

@@ -80,15 +80,21 @@ impl Computer {
 
     /// The running Pinions that no stranger has started, without their helpers.
     pub(in crate::cli) fn running(&self) -> Vec<Running> {
-        let pinions = self.processes(|process| self.is_pinion(process));
-        pinions.map(|(process, unit)| self.pinion(&process, unit)).collect()
+        let pinions = self.all_processes().into_iter().filter(|process| self.is_pinion(process));
+        let ours = pinions.filter_map(|process| match self.starter_of_pinion(process.pid) {
+            Starter::Stranger => None,
+            starter => Some(self.pinion(&process, starter.unit())),
+        });
+        ours.collect()
     }
 
     /// The processes of strangers that are called like a Pinion or a klippy.
     pub(in crate::cli) fn strangers(&self) -> Vec<Process> {
         let mut processes = self.all_processes();
-        processes.retain(|process| self.is_pinion(process) || process.is_klippy());
-        processes.retain(|process| self.starter_of(process.pid) == Starter::Stranger);
+        processes.retain(|process| match self.is_pinion(process) {
+            true => self.starter_of_pinion(process.pid) == Starter::Stranger,
+            false => process.is_klippy() && self.starter_of(process.pid) == Starter::Stranger,
+        });
         processes
     }
 
@@ -118,9 +124,20 @@ impl Computer {
 
     /// Who started a process.
     pub(in crate::cli) fn starter_of(&self, pid: u32) -> Starter {
+        self.starter_among(pid, &["pinion", "klippy", "klipper"])
+    }
+
+    /// The same for a Pinion. klippy's unit starts none: a host that calls a process of its own so is no Pinion whose
+    /// user needs more groups.
+    fn starter_of_pinion(&self, pid: u32) -> Starter {
+        self.starter_among(pid, &["pinion"])
+    }
+
+    /// Who started a process, if only units with one of these words count.
+    fn starter_among(&self, pid: u32, programs: &[&str]) -> Starter {
         let groups = self.text(format!("/proc/{pid}/cgroup")).unwrap_or_default();
         let unit = process::unit(&groups);
-        if let Some(unit) = unit.filter(|unit| self.starts_hosts(unit)) {
+        if let Some(unit) = unit.filter(|unit| self.starts(unit, programs)) {
             return Starter::Unit(unit.to_owned());
         }
         let Some(Ids { uids, .. }) = self.ids_of(pid) else { return Starter::Stranger };
@@ -137,14 +154,14 @@ impl Computer {
         }
     }
 
-    /// Whether a unit starts Pinion or klippy, so that a restart of the unit starts them anew. Any user may have
+    /// Whether a unit starts one of these programs, so that a restart of the unit starts it anew. Any user may have
     /// processes in other units, such as cron's.
-    fn starts_hosts(&self, unit: &str) -> bool {
+    fn starts(&self, unit: &str, programs: &[&str]) -> bool {
         // systemd makes some units without a file in these folders, from scripts of System V. Then the name counts.
         let text = units::text(self, unit).or_else(|| units::text(self, &units::template(unit)?));
         let command = text.and_then(|text| setting(&text, "ExecStart").map(str::to_lowercase));
         let command = command.unwrap_or_else(|| unit.split('@').next().unwrap_or_default().to_lowercase());
-        ["pinion", "klippy", "klipper"].iter().any(|program| command.contains(program))
+        programs.iter().any(|program| command.contains(program))
     }
 }
 
@@ -284,6 +301,23 @@ mod tests {
         }
         tree.put("proc/7/cgroup", "4:pids:/\n1:name=systemd:/system.slice/klipper.service\n0::/\n");
         assert_eq!(tree.computer().starter_of(7), Starter::Unit("klipper".into()));
+    }
+
+    /// The host is trusted with the pins, and not with more groups.
+    #[test]
+    fn a_false_pinion_of_the_host_is_none() {
+        let tree = Tree::new();
+        tree.put("proc/7/cgroup", "0::/system.slice/klipper.service\n");
+        tree.process(7, &["pinion", "run"], MALLORY, &[]);
+        let pids = |computer: &Computer| computer.running().iter().map(|pinion| pinion.pid).collect::<Vec<_>>();
+        let strangers =
+            |computer: &Computer| computer.strangers().iter().map(|process| process.pid).collect::<Vec<_>>();
+        assert_eq!((pids(&tree.computer()), strangers(&tree.computer())), (vec![], vec![7]));
+        assert_eq!(pids(&tree.called_by(MALLORY)), [7], "the caller's own");
+        // Pinion in the place of Klipper's own program.
+        tree.put("proc/7/cgroup", "0::/system.slice/klipper-mcu.service\n");
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion run -r\n");
+        assert_eq!((pids(&tree.computer()), strangers(&tree.computer())), (vec![7], vec![]));
     }
 
     #[test]

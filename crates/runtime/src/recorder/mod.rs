@@ -229,10 +229,11 @@ impl Recording {
     }
 }
 
-/// Whether the host had asked for the stop, and nobody was late.
+/// Whether the host, or who stops its service, had asked for the stop, and nobody was late.
 fn is_asked(trace: &Trace, found: &Verdict) -> bool {
+    let asked = [reason::COMMAND_REQUEST.text(), reason::FORCE_SHUTDOWN.text()];
     found.culprit == Culprit::Nobody
-        && matches!(&trace.head.end, End::Shutdown { reason, .. } if reason == reason::COMMAND_REQUEST.text())
+        && matches!(&trace.head.end, End::Shutdown { reason, .. } if asked.contains(&reason.as_str()))
 }
 
 /// How often files are made.
@@ -449,8 +450,8 @@ mod tests {
         let mut paces = Paces { asked: ASKED_RECORDINGS, others: RECORDINGS };
         recording.keep_stop(&stop(&recording, "ADC out of range"), &mut paces);
         let first = names(folder.path());
-        for _ in 0..20 {
-            recording.keep_stop(&stop(&recording, reason::COMMAND_REQUEST.text()), &mut paces);
+        for asked in [reason::COMMAND_REQUEST, reason::FORCE_SHUTDOWN].iter().cycle().take(20) {
+            recording.keep_stop(&stop(&recording, asked.text()), &mut paces);
         }
         let both = names(folder.path());
         assert_eq!(both.len(), 2, "{both:?}");

@@ -9,6 +9,8 @@ use std::fs::{self, Metadata};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use nix::unistd::geteuid;
+
 use crate::host::klippy::process::{self, Process, is_pseudo_terminal, server};
 use pinion_linux::foreign;
 
@@ -32,6 +34,8 @@ pub struct Served {
     program: Option<&'static str>,
     pid: Option<u32>,
     unit: Option<String>,
+    /// Whether a link on the way to the terminal is neither root's, nor ours, nor the terminal's owner's.
+    is_planted: bool,
 }
 
 /// The terminal behind a link, if a running program serves it.
@@ -53,6 +57,9 @@ pub fn served(link: &Path) -> Option<Served> {
     if server.as_ref().and_then(known).is_none() && is_younger(&terminal, &fs::symlink_metadata(last_link).ok()?) {
         return None;
     }
+    let trusted = [0, geteuid().as_raw(), terminal.uid()];
+    let is_of_another = |link: &PathBuf| fs::symlink_metadata(link).is_ok_and(|about| !trusted.contains(&about.uid()));
+    let is_planted = way.iter().take_while(|path| *path != device).any(is_of_another);
     let server = server.or_else(|| hidden_server(proc, &way, &terminal));
     let groups = server.as_ref().and_then(|server| {
         let groups = foreign::read(&proc.join(server.pid.to_string()).join("cgroup"), GROUPS_BYTES_MAX).ok()?;
@@ -66,6 +73,7 @@ pub fn served(link: &Path) -> Option<Served> {
         pid: server.map(|process| process.pid),
         // A program that cron started, for example, belongs to cron's unit.
         unit: unit.filter(|unit| unit.contains("pinion") || unit.contains("klipper")).map(str::to_owned),
+        is_planted,
     })
 }
 
@@ -127,10 +135,14 @@ fn hidden_server(proc: &Path, way: &[PathBuf], terminal: &Metadata) -> Option<Pr
 
 impl fmt::Display for Served {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Served { link, device, program, pid, unit } = self;
+        let Served { link, device, program, pid, unit, is_planted } = self;
         let served_by = program.unwrap_or("another program");
         write!(f, "{} leads to {}, which {served_by} serves", link.display(), device.display())?;
         pid.map_or(Ok(()), |pid| write!(f, " (process {pid})"))?;
+        if *is_planted {
+            // Any user can make a link in /tmp to the terminal of a program that has nothing to do with it.
+            return write!(f, ": remove the link, which another user has made");
+        }
         match (program, unit, pid) {
             // Any user can make a link in /tmp to any terminal, such as the one of root's login.
             (None, _, Some(_)) => write!(f, ": remove the link, unless that program has made it"),
@@ -177,6 +189,26 @@ mod tests {
         assert!(served(&link).is_none(), "it is another's terminal");
     }
 
+    /// Any user can have one program's link lead to another program's terminal.
+    #[test]
+    fn a_link_of_another_user_stops_no_program() {
+        if !pinion_testkit::here::is_root() {
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("klipper_host_mcu");
+        let pty = openpty(None, None).unwrap();
+        symlink(ttyname(&pty.slave).unwrap(), &link).unwrap();
+        for owner in [0, 65_534] {
+            std::os::unix::fs::lchown(&link, Some(owner), None).unwrap();
+            let found = served(&link).unwrap();
+            let told = Served { program: Some("Pinion"), pid: Some(7), ..found }.to_string();
+            let remedy =
+                if owner == 0 { "stop it (sudo kill 7)" } else { "remove the link, which another user has made" };
+            assert!(told.ends_with(&format!("which Pinion serves (process 7): {remedy}")), "{told}");
+        }
+    }
+
     #[test]
     fn a_round_of_links_leads_nowhere() {
         let folder = tempfile::tempdir().unwrap();
@@ -189,7 +221,8 @@ mod tests {
     fn what_stops_a_program_is_told() {
         let by = |program, unit: Option<&str>, pid| {
             let (link, device) = ("/tmp/klipper_host_mcu".into(), "/dev/pts/3".into());
-            Served { link, device, program, pid, unit: unit.map(str::to_owned) }.to_string()
+            let unit = unit.map(str::to_owned);
+            Served { link, device, program, pid, unit, is_planted: false }.to_string()
         };
         let told = |unit, pid| by(Some("Pinion"), unit, pid);
         let begins = "/tmp/klipper_host_mcu leads to /dev/pts/3, which Pinion serves";

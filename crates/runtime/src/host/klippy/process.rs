@@ -79,10 +79,12 @@ impl Terminal {
         })
     }
 
-    /// Whether these users may open it.
+    /// Whether these users may open it. A program with the set-user-ID bit counts as its caller's: any user can have
+    /// many processes of su, with many files.
     fn lets_in(self, ids: &Ids) -> bool {
         const READ_WRITE: u32 = 6;
-        ids.may(READ_WRITE, (self.owner, self.group, self.mode))
+        let is_one_user = ids.uids.iter().all(|uid| *uid == ids.user());
+        is_one_user && ids.may(READ_WRITE, (self.owner, self.group, self.mode))
     }
 
     fn is(self, file: &fs::Metadata) -> bool {
@@ -569,6 +571,10 @@ mod tests {
         assert_eq!(found(), None, "the search has an end");
         put(proc.path(), 90, &["host"], (990, 990), &[&device]);
         assert_eq!(found(), Some(90), "the terminal's owner");
+        // As su is while it asks for a password: it has the files of its caller, and root's rights.
+        let su = "Uid:\t54321\t0\t0\t0\nGid:\t54321\t54321\t54321\t54321\nGroups:\t\n";
+        fs::write(proc.path().join("20/status"), su).unwrap();
+        assert_eq!(found(), Some(90), "who calls su is not root");
     }
 
     #[test]
