@@ -16,8 +16,8 @@ use log::warn;
 
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, InputLine, Look, Next, Object, Oid, Response, Slot, Timer, Turn, WireClock,
-    WorkerId, command, response,
+    Back, Command, Context, Done, Errand, Feature, InputLine, Look, Next, Object, Oid, Response, Slot, Timer,
+    WireClock, WorkerId, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -179,27 +179,27 @@ struct Counter {
 
 impl Counter {
     /// Processes the level at a given time.
-    fn look(&mut self, turn: &mut Turn, level: bool, at: Clock) {
+    fn look(&mut self, context: &mut Context, level: bool, at: Clock) {
         if level != (self.count % 2 == 1) {
             self.count = self.count.wrapping_add(1);
             self.count_clock = at;
         }
         if self.next_sample < at {
             self.next_sample = at + self.sample_ticks;
-            self.tell(turn, at);
+            self.tell(context, at);
         }
     }
 
     /// Reports the count as it was at a given time.
-    fn tell(&mut self, turn: &mut Turn, at: Clock) {
+    fn tell(&mut self, context: &mut Context, at: Clock) {
         let next_clock = at + self.poll_ticks;
-        turn.send(State { oid: turn.oid(), next_clock, count: self.count, count_clock: self.count_clock });
+        context.send(State { oid: context.oid(), next_clock, count: self.count, count_clock: self.count_clock });
     }
 
     /// Processes the edges that the worker has read.
     fn has_read(
         &mut self,
-        turn: &mut Turn,
+        context: &mut Context,
         edges: Result<(u32, Option<Clock>), Shutdown>,
         ended: Clock,
     ) -> Result<(), Shutdown> {
@@ -209,11 +209,11 @@ impl Counter {
                 self.count = count;
                 self.count_clock = last.unwrap_or(self.count_clock);
                 if counts {
-                    self.tell(turn, ended);
+                    self.tell(context, ended);
                 }
                 Ok(())
             }
-            Err(failure) => turn.try_shut_down(failure),
+            Err(failure) => context.try_shut_down(failure),
         }
     }
 }
@@ -223,7 +223,7 @@ impl Object for Counter {
         "counter"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if let Some(Counted { worker, reading }) = &mut self.counted
             && !reading.here().is_some_and(|reading| reading.given_up)
         {
@@ -234,16 +234,16 @@ impl Object for Counter {
             // A worker that is still reading misses this turn.
             if let Some(ready) = reading.here() {
                 ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
-                reading.send(turn, *worker)?;
+                reading.send(context, *worker)?;
             }
             return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
         // An expander that is still being read also misses it.
         if self.pin.is_looking() {
-            self.pin.awaited(turn)?;
+            self.pin.awaited(context)?;
         } else {
-            match self.pin.read(turn)? {
-                Some(level) => self.look(turn, level, at),
+            match self.pin.read(context)? {
+                Some(level) => self.look(context, level, at),
                 None => self.counts = true,
             }
         }
@@ -251,42 +251,42 @@ impl Object for Counter {
     }
 
     /// A worker has read the count, or the pin of an expander.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         if let Some(counted) = &mut self.counted
             && let Some(Back { result, ended, .. }) = counted.reading.back(done)
         {
             let edges = result.map_err(Shutdown::clone);
-            return self.has_read(turn, edges, ended);
+            return self.has_read(context, edges, ended);
         }
-        let Some(look) = self.pin.sampled(turn, done) else { return Ok(()) };
+        let Some(look) = self.pin.sampled(context, done) else { return Ok(()) };
         let Look { level, ended, .. } = look?;
         if std::mem::take(&mut self.counts) {
             // A pin that could not be read keeps its last level.
-            self.look(turn, level.unwrap_or(self.count % 2 == 1), ended);
+            self.look(context, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.counts = false;
     }
 }
 
 const CONFIG_COUNTER: Command =
-    command!("config_counter oid=%c pin=%u pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
-        mcu.vacant(oid)?;
-        let (line, edges) = mcu.counted_input(pin, bias(pull_up))?;
-        let name = mcu.name(pin);
+    command!("config_counter oid=%c pin=%u pull_up=%c", |context, oid: Oid, pin: Pin, pull_up: i8| {
+        context.vacant(oid)?;
+        let (line, edges) = context.counted_input(pin, bias(pull_up))?;
+        let name = context.name(pin);
         let counted = match edges {
             Ok((worker, edges)) => {
                 let level = line.prompt_level()?.unwrap_or_default();
                 let reading = Reading {
                     edges,
-                    clock: mcu.clock(),
+                    clock: context.clock(),
                     name,
                     settling: Settling::new(level),
                     settle: Ticks(0),
-                    since: mcu.now(),
+                    since: context.now(),
                     interrupts: 0,
                     given_up: false,
                 };
@@ -307,15 +307,15 @@ const CONFIG_COUNTER: Command =
             count_clock: Clock::EPOCH,
             counts: false,
         };
-        mcu.assign_on(pin, oid, counter)
+        context.assign_on(pin, oid, counter)
     });
 
 const QUERY_COUNTER: Command = command!(
     "query_counter oid=%c clock=%u poll_ticks=%u sample_ticks=%u",
     Counter,
-    |counter, turn, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    |counter, context, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         counter.poll_ticks = poll_ticks;
         counter.sample_ticks = sample_ticks;
         counter.next_sample = at;
@@ -323,7 +323,7 @@ const QUERY_COUNTER: Command = command!(
             counter.count_clock = at;
         }
         counter.counts = false;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );
 

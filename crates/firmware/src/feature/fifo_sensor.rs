@@ -11,7 +11,7 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Back, Conversation, Done, Enumeration, Feature, Generation::V0_13, Mcu, Next, Object, Oid, Slot, Talk, Timer, Turn,
+    Back, Context, Conversation, Done, Enumeration, Feature, Generation::V0_13, Next, Object, Oid, Slot, Talk, Timer,
     WireClock, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
@@ -75,10 +75,10 @@ impl BusType {
     }
 
     /// The shutdown for a sensor's failed conversation.
-    pub(super) fn failed(self, mcu: &Mcu, error: BusError) -> Shutdown {
+    pub(super) fn failed(self, context: &Context, error: BusError) -> Shutdown {
         match self {
             BusType::Spi => spi_shutdown(error),
-            BusType::I2c => i2c_shutdown(mcu, error),
+            BusType::I2c => i2c_shutdown(context, error),
         }
     }
 }
@@ -300,27 +300,27 @@ impl<C: FifoChip> FifoSensor<C> {
     const NONSENSE_BYTES: u32 = 0x7f * C::SAMPLE_BYTES as u32;
 
     /// Starts a reading, or makes one follow the reading under way.
-    fn read(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn read(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let Some(Conversation { talk: Read { reading, .. }, .. }) = self.read.here() else {
             self.waiting = true;
             return Ok(());
         };
         (reading.len, reading.room, reading.overflows) = (0, self.bulk.room(), 0);
-        self.read.converse(turn, self.device)
+        self.read.converse(context, self.device)
     }
 
-    fn has_read(&mut self, turn: &mut Turn, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
+    fn has_read(&mut self, context: &mut Context, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
         self.bulk.count_overflows(reading.overflows);
         for sample in reading.samples[..reading.len].chunks(C::SAMPLE_BYTES) {
-            self.bulk.add(turn, sample);
+            self.bulk.add(context, sample);
         }
         match self.phase {
             // Nothing more is read before the sensor is off.
             Phase::Ends(None, _) => Ok(()),
-            Phase::Ends(Some(_), _) => self.ask_status(turn),
-            _ if reading.more => self.read(turn),
+            Phase::Ends(Some(_), _) => self.ask_status(context),
+            _ if reading.more => self.read(context),
             _ => {
-                turn.go_on(TIMER, ended + self.rest_ticks);
+                context.go_on(TIMER, ended + self.rest_ticks);
                 Ok(())
             }
         }
@@ -341,74 +341,79 @@ impl<C: FifoChip> FifoSensor<C> {
         }
     }
 
-    fn failed(&mut self, turn: &mut Turn, error: BusError) -> Result<(), Shutdown> {
-        let failure = self.chip.bus_type().failed(turn, error);
-        turn.device_failed(C::NAME, failure)
+    fn failed(&mut self, context: &mut Context, error: BusError) -> Result<(), Shutdown> {
+        let failure = self.chip.bus_type().failed(context, error);
+        context.device_failed(C::NAME, failure)
     }
 
-    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
         // A switch is under way. `switched` then does what is wanted by that time.
         let Some(switch) = self.switch.here() else { return Ok(()) };
         switch.talk.on = on;
-        self.switch.converse(turn, self.device)
+        self.switch.converse(context, self.device)
     }
 
     /// The sensor is now on, or off.
-    fn switched(&mut self, turn: &mut Turn, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
+    fn switched(&mut self, context: &mut Context, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
         match self.phase {
             // It was switched for an earlier query.
             Phase::Idle | Phase::Begins => Ok(()),
-            Phase::SwitchesOn if !on => self.switch(turn, true),
+            Phase::SwitchesOn if !on => self.switch(context, true),
             Phase::SwitchesOn => {
                 self.phase = Phase::Idle;
-                turn.go_on(TIMER, span.1 + self.rest_ticks);
+                context.go_on(TIMER, span.1 + self.rest_ticks);
                 Ok(())
             }
-            Phase::Ends(..) if on => self.switch(turn, false),
+            Phase::Ends(..) if on => self.switch(context, false),
             Phase::Ends(..) => {
                 self.phase = Phase::Ends(Some(span), LAST_READS);
-                self.ask_status(turn)
+                self.ask_status(context)
             }
         }
     }
 
     /// Measures from `clock` on, for a host up to v0.12. The MCU switches the sensor on and off. The number of samples
     /// answers the end. `rest_ticks` of 0 ends the measurement.
-    pub(super) fn query_at(&mut self, turn: &mut Turn, clock: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+    pub(super) fn query_at(
+        &mut self,
+        context: &mut Context,
+        clock: WireClock,
+        rest_ticks: Ticks,
+    ) -> Result<(), Shutdown> {
         if rest_ticks == Ticks(0) {
-            return self.stop(turn);
+            return self.stop(context);
         }
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         self.end();
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
         self.phase = Phase::Begins;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 
     /// Switches the sensor off, sends the remaining samples, and reports their number to the host. A reading under way
     /// counts.
-    fn stop(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    fn stop(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.waiting = false;
         self.phase = Phase::Ends(None, LAST_READS);
-        self.switch(turn, false)
+        self.switch(context, false)
     }
 
     /// Processes the chip's answer about its FIFO. `None`: the answer makes no sense.
-    fn has_filled(&mut self, turn: &mut Turn, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
+    fn has_filled(&mut self, context: &mut Context, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
         if let Phase::Ends(Some(off), reads) = self.phase {
-            return self.ended(turn, off, fill, reads);
+            return self.ended(context, off, fill, reads);
         }
         match fill {
             Some(Fill { bytes, overflowed }) => {
                 self.bulk.count_overflows(overflowed.into());
                 self.has_pending(bytes);
-                self.bulk.send_status(turn, span, bytes.into());
+                self.bulk.send_status(context, span, bytes.into());
             }
-            None if C::OWN_WORDS.is_some() && !turn.speaks::<BulkData<'_>>() => {
-                self.bulk.send_status(turn, span, Self::NONSENSE_BYTES);
+            None if C::OWN_WORDS.is_some() && !context.speaks::<BulkData<'_>>() => {
+                self.bulk.send_status(context, span, Self::NONSENSE_BYTES);
             }
             // Since v0.13, klippy asks again if it gets no answer.
             None => {}
@@ -417,45 +422,51 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     /// The same after the sensor was switched off.
-    fn ended(&mut self, turn: &mut Turn, off: (Clock, Clock), fill: Option<Fill>, reads: u8) -> Result<(), Shutdown> {
+    fn ended(
+        &mut self,
+        context: &mut Context,
+        off: (Clock, Clock),
+        fill: Option<Fill>,
+        reads: u8,
+    ) -> Result<(), Shutdown> {
         let bytes = fill.map(|fill| fill.bytes);
         // After an answer that makes no sense the chip is asked again, because samples may be left.
         if C::KEEPS_SAMPLES && bytes != Some(0) && reads > 0 {
             self.phase = Phase::Ends(Some(off), reads - 1);
-            return if bytes.is_none() { self.ask_status(turn) } else { self.read(turn) };
+            return if bytes.is_none() { self.ask_status(context) } else { self.read(context) };
         }
         self.phase = Phase::Idle;
-        self.bulk.flush(turn);
-        self.bulk.send_status(turn, off, bytes.map_or(Self::NONSENSE_BYTES, u32::from));
+        self.bulk.flush(context);
+        self.bulk.send_status(context, off, bytes.map_or(Self::NONSENSE_BYTES, u32::from));
         Ok(())
     }
 
     /// Measures, with `rest_ticks` between two looks into the FIFO. `rest_ticks` of 0 ends the measurement.
-    pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    pub(super) fn query(&mut self, context: &mut Context, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
-        let at = turn.now() + rest_ticks;
-        turn.go_on(TIMER, at);
+        let at = context.now() + rest_ticks;
+        context.go_on(TIMER, at);
         Ok(())
     }
 
     /// Asks the sensor how many samples it has.
-    pub(super) fn ask_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    pub(super) fn ask_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if !C::HAS_OVERFLOW_REGISTER {
-            return self.ask_fill(turn);
+            return self.ask_fill(context);
         }
         self.overflow.here().ok_or_else(status_amid_status)?;
-        self.overflow.converse(turn, self.device)
+        self.overflow.converse(context, self.device)
     }
 
-    fn ask_fill(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn ask_fill(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         self.fill.here().ok_or_else(status_amid_status)?;
-        self.fill.converse(turn, self.device)
+        self.fill.converse(context, self.device)
     }
 }
 
@@ -470,66 +481,66 @@ impl<C: FifoChip> Object for FifoSensor<C> {
         C::NAME
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         if self.phase == Phase::Begins {
             self.phase = Phase::SwitchesOn;
-            self.switch(turn, true)?;
+            self.switch(context, true)?;
         } else {
-            self.read(turn)?;
+            self.read(context)?;
         }
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         let error = if let Some(Back { result, counts, ended, .. }) = self.read.back(done) {
             let result = result.map_err(BusError::clone);
             if !counts {
                 self.has_pending(0);
             }
             match result {
-                Ok(reading) if counts => return self.has_read(turn, reading, ended),
-                Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(turn) } else { Ok(()) },
+                Ok(reading) if counts => return self.has_read(context, reading, ended),
+                Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(context) } else { Ok(()) },
                 Err(error) => error,
             }
         } else if let Some(Back { result, began, ended, .. }) = self.switch.back(done) {
             match result {
-                Ok(on) => return self.switched(turn, on, (began, ended)),
+                Ok(on) => return self.switched(context, on, (began, ended)),
                 Err(error) => error.clone(),
             }
         } else if let Some(Back { result, .. }) = self.overflow.back(done) {
             match result {
                 Ok(overflowed) => {
                     self.bulk.count_overflows(overflowed.into());
-                    return self.ask_fill(turn);
+                    return self.ask_fill(context);
                 }
                 Err(error) => error.clone(),
             }
         } else if let Some(Back { result, began, ended, .. }) = self.fill.back(done) {
             match result {
-                Ok(fill) => return self.has_filled(turn, fill, (began, ended)),
+                Ok(fill) => return self.has_filled(context, fill, (began, ended)),
                 Err(error) => error.clone(),
             }
         } else {
             return Ok(());
         };
-        self.failed(turn, error)
+        self.failed(context, error)
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.end();
     }
 }
 
 /// Makes a sensor with this `oid`, on the bus device `device`.
-pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
+pub(super) fn configure<C: FifoChip>(context: &mut Context, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
     match chip.bus_type() {
-        BusType::Spi => mcu.require::<Spi>(device)?,
-        BusType::I2c => mcu.require::<I2c>(device)?,
+        BusType::Spi => context.require::<Spi>(device)?,
+        BusType::I2c => context.require::<I2c>(device)?,
     }
     let sensor = FifoSensor {
         chip,
         device,
-        bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(mcu, own)),
+        bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(context, own)),
         rest_ticks: Ticks(0),
         phase: Phase::Idle,
         switch: Slot::talking(Switch { chip, on: false }),
@@ -538,5 +549,5 @@ pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip:
         fill: Slot::talking(LookAtFill(chip)),
         overflow: Slot::talking(LookForOverflow(chip)),
     };
-    mcu.assign(oid, sensor)
+    context.assign(oid, sensor)
 }

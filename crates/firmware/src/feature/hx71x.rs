@@ -15,8 +15,8 @@ use std::sync::{Arc, Mutex};
 
 use crate::board::{Bias, Direction, Line, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
-    Settable, Slot, Turn, WorkerId, command, since,
+    Back, Command, Context, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Oid,
+    Remote, Settable, Slot, WorkerId, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -123,15 +123,15 @@ impl ReadyChip for Hx71x {
     const NAME: &'static str = "HX71x";
     type Reading = Reading;
 
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
+    fn read(&mut self, context: &mut Context, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
         if let Some((worker, watcher)) = &mut self.watcher {
             // After a reading without its last pulses it may still watch one of them.
             if !watcher.is_here() {
                 return Ok(());
             }
-            watcher.send(turn, *worker)?;
+            watcher.send(context, *worker)?;
         }
-        reading.send(turn, self.worker)
+        reading.send(context, self.worker)
     }
 
     fn stop(failure: &Shutdown) -> Shutdown {
@@ -149,24 +149,24 @@ impl ReadyChip for Hx71x {
         Sample::Error { code: None, value: self.last_error.unwrap_or(ERROR_DESYNC) }
     }
 
-    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
         self.last_error = None;
-        self.power_down.set(turn, !on)
+        self.power_down.set(context, !on)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         if let Some(Back { result, .. }) = self.watcher.as_mut().and_then(|(_, watcher)| watcher.back(done)) {
-            return result.or_else(|failure| turn.try_shut_down(failure.clone()));
+            return result.or_else(|failure| context.try_shut_down(failure.clone()));
         }
-        match self.power_down.back(turn, done) {
-            Some(Err(failure)) => turn.try_shut_down(failure),
+        match self.power_down.back(context, done) {
+            Some(Err(failure)) => context.try_shut_down(failure),
             _ => Ok(()),
         }
     }
 }
 
-fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
-    mcu.vacant(oid)?;
+fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
+    context.vacant(oid)?;
     if !(1..=4).contains(&gain_channel) {
         return Err(Shutdown::by_host(
             GAIN_RANGE,
@@ -174,47 +174,47 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         ));
     }
     let pulses = SAMPLE_BITS + gain_channel;
-    if let Some(mosi) = mcu.board()?.mosi_of(dout_pin) {
-        let (dout, sclk) = (mcu.name(dout_pin), mcu.name(sclk_pin));
+    if let Some(mosi) = context.board()?.mosi_of(dout_pin) {
+        let (dout, sclk) = (context.name(dout_pin), context.name(sclk_pin));
         if mosi != sclk_pin {
             let (remedy, cause) =
-                (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
+                (format!("write sclk_pin: {}", context.name(mosi)), format!("{dout} has another clock than {sclk}"));
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
         }
-        let Some(Mosi { line: OnWorker { bus, device }, .. }) = mcu.board()?.mosi(mosi, spi::RATE_HZ)? else {
+        let Some(Mosi { line: OnWorker { bus, device }, .. }) = context.board()?.mosi(mosi, spi::RATE_HZ)? else {
             let cause = format!("{sclk} is no data output of an SPI device");
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
         };
-        let worker = mcu.worker(&bus)?;
+        let worker = context.worker(&bus)?;
         let device: Shared = Arc::new(Mutex::new(device));
         let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);
         let chip = Hx71x { worker, gain_channel, power_down, watcher: None, last_error: None };
         let waves = Slot::new(Reading::Spi(Waves::new(device, pulses, sclk)));
-        return mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
+        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
     }
-    let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
+    let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
-    let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
-    let worker = mcu.worker(WORKER)?;
+    let sclk = context.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
+    let worker = context.worker(WORKER)?;
     // A call of the kernel takes about as long as a watcher waits.
-    let is_watched = sclk.is_fast() && mcu.has_parallel_workers();
-    let watcher = is_watched.then(|| Watcher::new(mcu, sclk.clone()));
-    let shift = Shift::new(mcu, sclk_pin, sclk.clone(), dout.clone(), pulses, watcher.as_ref());
+    let is_watched = sclk.is_fast() && context.has_parallel_workers();
+    let watcher = is_watched.then(|| Watcher::new(context, sclk.clone()));
+    let shift = Shift::new(context, sclk_pin, sclk.clone(), dout.clone(), pulses, watcher.as_ref());
     let watcher = match watcher {
-        Some(watcher) => Some((mcu.worker(WATCHER)?, Slot::new(watcher))),
+        Some(watcher) => Some((context.worker(WATCHER)?, Slot::new(watcher))),
         None => None,
     };
     let power_down = Remote::new(worker, PowerDown::Line(sclk), true);
     let chip = Hx71x { worker, gain_channel, power_down, watcher, last_error: None };
-    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
+    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
 }
 
 type Sensor = ReadyAdc<Hx71x>;
 
 const CONFIG_HX71X: Command = command!(
     "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u",
-    |mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
-        configure(mcu, oid, gain_channel, dout_pin, sclk_pin)
+    |context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
+        configure(context, oid, gain_channel, dout_pin, sclk_pin)
     }
 )
 .of(since(V0_13));
@@ -222,24 +222,25 @@ const CONFIG_HX71X: Command = command!(
 const HX71X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
-    |sensor, turn, trigger_analog_oid: Oid| { sensor.attached.attach(turn, trigger_analog_oid) }
+    |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
 .of(since(Master));
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
-    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
+    |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
-const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-    sensor.query(turn, rest_ticks)
-})
-.of(since(V0_13));
+const QUERY_HX71X: Command =
+    command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
+    })
+    .of(since(V0_13));
 
 const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", Sensor, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
+    command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

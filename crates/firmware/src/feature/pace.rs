@@ -9,7 +9,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::mcu::Mcu;
+use crate::mcu::Context;
 use crate::time::{Clock, Ticks, TimeSource};
 
 /// Longest time that a wait continues after a stop.
@@ -37,8 +37,8 @@ pub(super) struct Pace {
 
 impl Pace {
     /// The pace of an object's errands.
-    pub(super) fn new(mcu: &Mcu) -> Pace {
-        Pace::of(mcu.clock())
+    pub(super) fn new(context: &Context) -> Pace {
+        Pace::of(context.clock())
     }
 
     /// A pace with this clock.

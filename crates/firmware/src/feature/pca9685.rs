@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Timer, Turn,
+    BusCounts, Calls, Command, Constant, Context, Done, Feature, Next, Object, Oid, Remote, Safe, Settable, Timer,
     WireClock, command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -182,7 +182,7 @@ struct Chips {
 
 impl Chips {
     /// Returns the index of an output. Opens the chip if this is its first output.
-    fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
+    fn output(&mut self, context: &mut Context, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
         let Address { bus, address, cycle } = wanted;
         let known = self.chips.iter().position(|chip| chip.bus == bus && chip.address == address);
         let chip = match known {
@@ -202,19 +202,19 @@ impl Chips {
                 return Err(Shutdown::because(TOO_MANY, cause).remedy("remove one"));
             }
             None => {
-                self.open(mcu, wanted)?;
+                self.open(context, wanted)?;
                 self.chips.len() - 1
             }
         };
         Ok(chip * CHANNELS + usize::from(channel))
     }
 
-    fn open(&mut self, mcu: &mut Mcu, address: Address) -> Result<(), Shutdown> {
+    fn open(&mut self, context: &mut Context, address: Address) -> Result<(), Shutdown> {
         let config = I2cConfig { bus: address.bus.into(), address: address.address & 0x7f, rate_hz: RATE_HZ };
-        let opened = mcu.board()?.i2c(config);
+        let opened = context.board()?.i2c(config);
         let OnWorker { bus, device } = opened.map_err(|error| Shutdown { reason: NOT_SET_UP, ..error })?;
-        let worker = mcu.worker(&bus)?;
-        let clock = mcu.clock();
+        let worker = context.worker(&bus)?;
+        let clock = context.clock();
         let calls = self.calls.get_or_insert_with(|| Calls::new(clock)).clone();
         let chip = Chip { device, calls, prescale: prescale(address.cycle), is_set_up: false };
         let chip = Arc::new(Mutex::new(chip));
@@ -227,10 +227,10 @@ impl Chips {
         Ok(())
     }
 
-    fn set(&mut self, turn: &mut Turn, place: usize, setting: Setting) -> Result<(), Shutdown> {
+    fn set(&mut self, context: &mut Context, place: usize, setting: Setting) -> Result<(), Shutdown> {
         let output = &mut self.outputs[place];
         output.is_used = true;
-        output.channel.set(turn, setting)
+        output.channel.set(context, setting)
     }
 }
 
@@ -239,16 +239,16 @@ impl Object for Chips {
         "PCA9685"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         let mut outputs = self.outputs.iter_mut();
-        let back = outputs.find_map(|output| output.channel.back(turn, done).map(|written| (output, written)));
+        let back = outputs.find_map(|output| output.channel.back(context, done).map(|written| (output, written)));
         match back {
             Some((output, Ok(true))) => output.is_pending = false,
-            Some((_, Err(failure))) => return turn.device_failed(self.kind(), failure),
+            Some((_, Err(failure))) => return context.device_failed(self.kind(), failure),
             _ => {}
         }
         if !self.outputs.iter().any(|output| output.is_pending) {
-            turn.is_safe();
+            context.is_safe();
         }
         Ok(())
     }
@@ -262,11 +262,11 @@ impl Object for Chips {
         false
     }
 
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
         let mut safe = Safe::Now;
         for output in self.outputs.iter_mut().filter(|output| output.is_used) {
             output.is_pending = true;
-            output.channel.set(turn, Setting::ShutdownValue(output.shutdown_value))?;
+            output.channel.set(context, Setting::ShutdownValue(output.shutdown_value))?;
             safe = Safe::Later;
         }
         Ok(safe)
@@ -283,11 +283,11 @@ struct Pca9685 {
 }
 
 impl Pca9685 {
-    fn queue(&mut self, turn: &mut Turn, at: Clock, value: u16) -> Result<(), Shutdown> {
+    fn queue(&mut self, context: &mut Context, at: Clock, value: u16) -> Result<(), Shutdown> {
         if value > VALUE_MAX {
             return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
         }
-        self.queue.queue(turn, at, value)
+        self.queue.queue(context, at, value)
     }
 }
 
@@ -296,15 +296,15 @@ impl Object for Pca9685 {
         "PCA9685 output"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        let value = self.queue.pop(turn)?;
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let value = self.queue.pop(context)?;
         let place = self.place;
-        turn.with::<Chips, _>(self.chips, |chips, turn| chips.set(turn, place, Setting::Value(value)))?;
+        context.with::<Chips, _>(self.chips, |chips, context| chips.set(context, place, Setting::Value(value)))?;
         self.queue.next(value, at)
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.queue.clear(turn);
+    fn shutdown(&mut self, context: &mut Context) {
+        self.queue.clear(context);
     }
 }
 
@@ -319,7 +319,7 @@ fn check(channel: u8, values: &[u16]) -> Result<(), Shutdown> {
 
 const CONFIG_PCA9685: Command = command!(
     "config_pca9685 oid=%c bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
-    |mcu,
+    |context,
      oid: Oid,
      bus: u8,
      addr: u8,
@@ -328,34 +328,37 @@ const CONFIG_PCA9685: Command = command!(
      value: u16,
      default_value: u16,
      max_duration: Ticks| {
-        mcu.vacant(oid)?;
+        context.vacant(oid)?;
         check(channel, &[value, default_value])?;
-        let own = mcu.own::<Chips>();
-        let place = mcu.with::<Chips, _>(own, |chips, turn| {
-            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+        let own = context.own::<Chips>();
+        let place = context.with::<Chips, _>(own, |chips, context| {
+            let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
             chips.outputs[place].shutdown_value = default_value;
             let setting = if value == 0 { Setting::SetUp } else { Setting::Value(value) };
-            chips.set(turn, place, setting)?;
+            chips.set(context, place, setting)?;
             Ok(place)
         })?;
-        mcu.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
+        context.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
     }
 );
 
-const QUEUE_PCA9685_OUT: Command =
-    command!("queue_pca9685_out oid=%c clock=%u value=%hu", Pca9685, |output, turn, clock: WireClock, value: u16| {
-        let at = turn.instant(clock);
-        output.queue(turn, at, value)
-    });
+const QUEUE_PCA9685_OUT: Command = command!(
+    "queue_pca9685_out oid=%c clock=%u value=%hu",
+    Pca9685,
+    |output, context, clock: WireClock, value: u16| {
+        let at = context.instant(clock);
+        output.queue(context, at, value)
+    }
+);
 
 const SET_PCA9685_OUT: Command = command!(
     "set_pca9685_out bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu",
-    |mcu, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
+    |context, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
         check(channel, &[value])?;
-        let own = mcu.own::<Chips>();
-        mcu.with::<Chips, _>(own, |chips, turn| {
-            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
-            chips.set(turn, place, Setting::Value(value))
+        let own = context.own::<Chips>();
+        context.with::<Chips, _>(own, |chips, context| {
+            let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.set(context, place, Setting::Value(value))
         })
     }
 );

@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
-    Back, Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Mcu, Object, Oid, Response, Safe, Slot, Talk, Turn, command, response, since, until,
+    Back, Bus, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Object, Oid, Response, Safe, Slot, Talk, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -157,7 +157,7 @@ impl Spi {
     }
 
     /// Checks that the device may get a bus, with this mode.
-    fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
+    fn may_have_bus(&self, context: &Context, mode: u8) -> Result<(), Shutdown> {
         if mode > 3 {
             return Err(invalid(format_args!("mode {mode} is outside 0 to 3")));
         }
@@ -165,43 +165,43 @@ impl Spi {
             return Err(invalid("it has a bus already"));
         }
         // The firmware opens a bus even then. Here the core would have to wait for the files, and steps with it.
-        if mcu.is_finalized() {
+        if context.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
         Ok(())
     }
 
-    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
-        self.may_have_bus(mcu, mode)?;
+    fn set_bus(&mut self, context: &mut Context, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
+        self.may_have_bus(context, mode)?;
         let chip_select = self.chip_select.clone();
-        let opened = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
-        self.bus = Some(mcu.bus(opened)?);
+        let opened = context.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
+        self.bus = Some(context.bus(opened)?);
         Ok(())
     }
 
-    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
-        self.may_have_bus(mcu, mode)?;
+    fn set_lines(&mut self, context: &mut Context, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
+        self.may_have_bus(context, mode)?;
         let [miso, mosi, sclk] = pins;
         // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {
-            miso: mcu.shared_input(miso)?,
-            mosi: mcu.shared_output(mosi, false)?,
-            sclk: mcu.shared_output(sclk, false)?,
+            miso: context.shared_input(miso)?,
+            mosi: context.shared_output(mosi, false)?,
+            sclk: context.shared_output(sclk, false)?,
             mode,
             pulse,
             chip_select: self.chip_select.clone(),
-            clock: mcu.clock(),
+            clock: context.clock(),
         };
-        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        self.bus = Some(context.software_bus(Box::new(device))?);
         Ok(())
     }
 
     /// Starts a transfer: with an answer for `spi_transfer`, without one for `spi_send`.
-    fn transfer(&mut self, turn: &mut Turn, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
+    fn transfer(&mut self, context: &mut Context, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // A device without a bus echoes, as in the firmware.
             if answers {
-                turn.send(TransferResponse { oid: turn.oid(), response: data });
+                context.send(TransferResponse { oid: context.oid(), response: data });
             }
             return Ok(());
         };
@@ -213,9 +213,9 @@ impl Spi {
             message.number = self.round.number();
             if answers { message.transfer.load(data) } else { message.transfer.load_to_send(data) }
         }
-        slot.converse_on(turn, bus)?;
+        slot.converse_on(context, bus)?;
         if !answers {
-            turn.let_join(UNDER_WAY_MAX as u32);
+            context.let_join(UNDER_WAY_MAX as u32);
         }
         Ok(())
     }
@@ -237,23 +237,23 @@ impl Object for Spi {
         "SPI device"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         let kind = self.kind();
         for slot in &mut self.messages {
             let Some(Back { result, .. }) = slot.back(done) else { continue };
             if let Err(error) = result {
                 let failure = spi_shutdown(error.clone());
-                return turn.device_failed(kind, failure);
+                return context.device_failed(kind, failure);
             }
             if let Some(Conversation { talk: message, .. }) = slot.here().filter(|here| here.talk.transfer.reads) {
-                turn.send(TransferResponse { oid: turn.oid(), response: message.transfer.bytes() });
+                context.send(TransferResponse { oid: context.oid(), response: message.transfer.bytes() });
             }
             return Ok(());
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.round.end();
     }
 
@@ -274,16 +274,16 @@ impl Object for SpiShutdown {
         "SPI shutdown message"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         let Some(Back { result, .. }) = self.message.back(done) else { return Ok(()) };
         match result {
             Ok(()) => {
-                turn.is_safe();
+                context.is_safe();
                 Ok(())
             }
             Err(error) => {
                 let failure = spi_shutdown(error.clone());
-                turn.device_failed(self.kind(), failure)
+                context.device_failed(self.kind(), failure)
             }
         }
     }
@@ -293,46 +293,49 @@ impl Object for SpiShutdown {
         false
     }
 
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        let has_bus = turn.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
+        let has_bus = context.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
         if !has_bus {
             return Ok(Safe::Now);
         }
         if let Some(message) = self.message.here() {
             message.talk.load_to_send(&self.bytes);
-            self.message.converse(turn, self.spi)?;
+            self.message.converse(context, self.spi)?;
         }
         Ok(Safe::Later)
     }
 }
 
 const CONFIG_SPI: Command =
-    command!("config_spi oid=%c pin=%u cs_active_high=%c", |mcu, oid: Oid, pin: Pin, cs_active_high: bool| {
-        mcu.vacant(oid)?;
-        let line = mcu.shared_output(pin, !cs_active_high)?;
-        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: mcu.clock() };
-        mcu.assign_on(pin, oid, Spi::new(Some(chip_select)))
+    command!("config_spi oid=%c pin=%u cs_active_high=%c", |context, oid: Oid, pin: Pin, cs_active_high: bool| {
+        context.vacant(oid)?;
+        let line = context.shared_output(pin, !cs_active_high)?;
+        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: context.clock() };
+        context.assign_on(pin, oid, Spi::new(Some(chip_select)))
     });
 
 const CONFIG_SPI_WITHOUT_CS: Command =
-    command!("config_spi_without_cs oid=%c", |mcu, oid: Oid| mcu.assign(oid, Spi::new(None)));
+    command!("config_spi_without_cs oid=%c", |context, oid: Oid| context.assign(oid, Spi::new(None)));
 
-const SPI_SET_BUS: Command =
-    command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", Spi, |spi, turn, spi_bus: u32, mode: u32, rate: u32| {
+const SPI_SET_BUS: Command = command!(
+    "spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u",
+    Spi,
+    |spi, context, spi_bus: u32, mode: u32, rate: u32| {
         let mode = u8::try_from(mode).unwrap_or(u8::MAX);
-        spi.set_bus(turn, spi_bus, mode, rate)
-    });
+        spi.set_bus(context, spi_bus, mode, rate)
+    }
+);
 
 const SPI_SET_SOFTWARE_BUS: Command = command!(
     "spi_set_software_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u rate=%u",
     Spi,
-    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
+    |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
         // The firmware ignored the rate and was as fast as its system calls. Lines that are written through mapped
         // registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
-        spi.set_lines(turn, pins, mode, pulse)
+        spi.set_lines(context, pins, mode, pulse)
     }
 )
 .of(until(V0_13));
@@ -340,25 +343,25 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
     Spi,
-    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
+    |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
         // The mode has one byte, as in the firmware.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        spi.set_lines(turn, pins, mode, pulse_ticks)
+        spi.set_lines(context, pins, mode, pulse_ticks)
     }
 )
 .of(since(Master).and(Kalico));
 
 const SPI_TRANSFER: Command =
-    command!("spi_transfer oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, true, data));
+    command!("spi_transfer oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, true, data));
 
 const SPI_SEND: Command =
-    command!("spi_send oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, false, data)).joining();
+    command!("spi_send oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, false, data)).joining();
 
 const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
-    |mcu, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
-        mcu.require::<Spi>(spi_oid)?;
-        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(), bytes: shutdown_msg.into() })
+    |context, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
+        context.require::<Spi>(spi_oid)?;
+        context.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(), bytes: shutdown_msg.into() })
     }
 );

@@ -13,7 +13,7 @@ use crate::board::{BusDevice, BusError, BusStatus, OnWorker};
 use crate::shutdown::Shutdown;
 use crate::trouble::Trouble;
 
-use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
+use super::{BusCounts, Calls, Context, Errand, Oid, Slot, WorkerId};
 
 /// A chip that several conversations use in turn. They all run on the worker of its bus, one after the other. So the
 /// lock is always free. The core never takes it.
@@ -94,9 +94,9 @@ impl<T: Talk> Slot<Conversation<T>> {
     /// # Errors
     ///
     /// "Invalid oid type" if the object represents no chip, "Bus worker queue overflow".
-    pub fn converse(&mut self, turn: &mut Turn, device: Oid) -> Result<(), Shutdown> {
-        let bus = turn.lend(device)?;
-        self.converse_on(turn, &bus)
+    pub fn converse(&mut self, context: &mut Context, device: Oid) -> Result<(), Shutdown> {
+        let bus = context.state.lend(device)?;
+        self.converse_on(context, &bus)
     }
 
     /// The same, for the object that represents the chip itself.
@@ -104,11 +104,11 @@ impl<T: Talk> Slot<Conversation<T>> {
     /// # Errors
     ///
     /// "Bus worker queue overflow".
-    pub fn converse_on(&mut self, turn: &mut Turn, bus: &Bus) -> Result<(), Shutdown> {
+    pub fn converse_on(&mut self, context: &mut Context, bus: &Bus) -> Result<(), Shutdown> {
         if let Some(conversation) = self.here() {
             conversation.device = Some(bus.device.clone());
         }
-        self.send(turn, bus.worker)
+        self.send(context, bus.worker)
     }
 }
 
@@ -129,7 +129,7 @@ impl Bus {
 /// worker runs them all.
 const SOFTWARE: &str = "software";
 
-impl Mcu {
+impl Context<'_> {
     /// A chip that the board has opened.
     ///
     /// # Errors

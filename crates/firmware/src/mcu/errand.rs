@@ -15,7 +15,7 @@ use std::any::Any;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::{Hold, Mcu, Oid, Turn};
+use super::{Context, Hold, Mcu, Oid};
 
 /// Work that may block.
 pub trait Errand: Send + 'static {
@@ -121,14 +121,18 @@ pub trait Workers: Send {
     fn reset(&mut self);
 }
 
-impl Mcu {
+impl Context<'_> {
+    pub(super) fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Refused> {
+        self.state.workers.submit(worker, job)
+    }
+
     /// The worker of a bus. Call it only before `finalize_config`, because it may start a thread.
     ///
     /// # Errors
     ///
     /// "Bus worker queue overflow" if it cannot be started.
     pub fn worker(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
-        self.workers.start(bus)
+        self.state.workers.start(bus)
     }
 
     /// The worker of a device that is only read, may be slow, and may be opened twice. A `config_reset` does not wait
@@ -138,26 +142,28 @@ impl Mcu {
     ///
     /// "Bus worker queue overflow" if it cannot be started.
     pub fn reader(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
-        let worker = self.workers.start(bus)?;
-        self.workers.leave_behind(worker);
+        let worker = self.state.workers.start(bus)?;
+        self.state.workers.leave_behind(worker);
         Ok(worker)
     }
 
     /// Whether two workers can run at the same time.
     pub fn has_parallel_workers(&self) -> bool {
-        self.workers.are_parallel()
+        self.state.workers.are_parallel()
     }
+}
 
+impl Mcu {
     /// Whether [`Mcu::run_workers`] has something to do.
     #[inline]
     pub fn has_completion(&self) -> bool {
-        self.workers.has_completion()
+        self.state.workers.has_completion()
     }
 
     /// Returns the finished errands to their objects.
     #[inline]
     pub fn run_workers(&mut self) {
-        while let Some(completion) = self.workers.completion() {
+        while let Some(completion) = self.state.workers.completion() {
             self.give_back(completion);
         }
         self.reset_if_due();
@@ -165,18 +171,18 @@ impl Mcu {
 
     fn give_back(&mut self, completion: Completion) {
         let Completion { oid, parcel, holds, began, ended } = completion;
-        if let Some(mut object) = self.take(oid) {
-            // If a command sent this errand, the errands that the object sends now also belong to the command.
-            self.holds.is_commanded = holds;
+        let state = &mut self.state;
+        if let Some(mut object) = state.objects.take(oid) {
+            state.barrier.take_back(holds);
             let mut done = Done { parcel: Some(parcel), began, ended };
-            let done = object.returned(&mut Turn::new(self, oid), &mut done);
-            let done = done.map_err(|stop| self.blame(stop, object.kind(), oid));
-            self.holds.is_commanded = false;
-            self.put_back(oid, object);
+            let done = object.returned(&mut Context::new(state, oid), &mut done);
+            let done = done.map_err(|stop| state.blame(stop, object.kind(), oid));
+            state.barrier.end_command();
+            state.objects.put_back(oid, object);
             if let Err(shutdown) = done {
                 self.shut_down(shutdown);
             }
         }
-        self.release(Hold(holds));
+        self.state.release(Hold(holds));
     }
 }

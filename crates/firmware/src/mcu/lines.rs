@@ -20,12 +20,38 @@ use crate::time::Clock;
 
 use super::snapshot::Level;
 use super::{
-    Back, Batch, Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Slot, Turn, UNREAD_LIMIT, Unread,
+    Back, Batch, Calls, Context, Done, Errand, LineState, Remote, Safe, Settable, Slot, State, UNREAD_LIMIT, Unread,
     WorkerId,
 };
 
+/// The GPIO lines in use.
+#[derive(Default)]
+pub(super) struct Outputs {
+    claims: Vec<Claim>,
+}
+
+impl Outputs {
+    pub(super) fn len(&self) -> usize {
+        self.claims.len()
+    }
+
+    /// The state of the line at this place, for the MCU's status.
+    pub(super) fn state(&self, place: usize) -> LineState {
+        self.claims[place].state()
+    }
+
+    /// Whether a line is in a bank.
+    pub(super) fn has_banks(&self) -> bool {
+        self.claims.iter().any(|claim| claim.line.bank().is_some())
+    }
+
+    fn find(&self, pin: Pin) -> Option<usize> {
+        self.claims.iter().position(|claim| claim.pin == pin)
+    }
+}
+
 /// A line in use.
-pub(super) struct Claim {
+struct Claim {
     /// The board's own number for it.
     pin: Pin,
     line: Arc<dyn Line>,
@@ -38,14 +64,10 @@ pub(super) struct Claim {
 }
 
 impl Claim {
-    pub(super) fn state(&self) -> LineState {
+    fn state(&self) -> LineState {
         let bus = self.slow.as_ref().map(|(_, calls)| calls.counts());
         let fast = self.line.is_fast();
         LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), fast, bus }
-    }
-
-    pub(super) fn is_in_bank(&self) -> bool {
-        self.line.bank().is_some()
     }
 
     /// The line for a user that calls it directly, for example an errand.
@@ -209,12 +231,12 @@ impl OutputLine {
     ///
     /// "GPIO line write failed".
     #[inline]
-    pub fn write(&mut self, turn: &mut Turn, level: bool) -> Result<(), Shutdown> {
+    pub fn write(&mut self, context: &mut Context, level: bool) -> Result<(), Shutdown> {
         self.level = level;
         self.shown.set(level);
         match &mut self.driver {
             Driver::Prompt(line) => line.write(level),
-            Driver::Slow(line) => line.set(turn, level),
+            Driver::Slow(line) => line.set(context, level),
         }
     }
 
@@ -224,8 +246,8 @@ impl OutputLine {
     ///
     /// "GPIO line write failed".
     #[inline]
-    pub fn toggle(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        self.write(turn, !self.level)
+    pub fn toggle(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        self.write(context, !self.level)
     }
 
     /// Drives the line of a stopped MCU to `level`, its shutdown value.
@@ -233,8 +255,8 @@ impl OutputLine {
     /// # Errors
     ///
     /// "GPIO line write failed".
-    pub fn make_safe(&mut self, turn: &mut Turn, level: bool) -> Result<Safe, Shutdown> {
-        self.write(turn, level)?;
+    pub fn make_safe(&mut self, context: &mut Context, level: bool) -> Result<Safe, Shutdown> {
+        self.write(context, level)?;
         Ok(match self.driver {
             Driver::Prompt(_) => Safe::Now,
             Driver::Slow(_) => Safe::Later,
@@ -246,10 +268,10 @@ impl OutputLine {
     /// # Errors
     ///
     /// "GPIO line write failed", unless the MCU is stopped.
-    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
+    pub fn settle(&mut self, context: &mut Context, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
         match &mut self.driver {
             Driver::Prompt(_) => Ok(()),
-            Driver::Slow(line) => line.settle(turn, kind, done),
+            Driver::Slow(line) => line.settle(context, kind, done),
         }
     }
 }
@@ -308,12 +330,12 @@ impl InputLine {
     ///
     /// "GPIO line read failed".
     #[inline]
-    pub fn read(&mut self, turn: &mut Turn) -> Result<Option<bool>, Shutdown> {
+    pub fn read(&mut self, context: &mut Context) -> Result<Option<bool>, Shutdown> {
         if let Sensor::Slow { worker, look, unread } = &mut self.sensor
             && look.is_here()
         {
-            unread.asked(turn.now());
-            look.send(turn, *worker)?;
+            unread.asked(context.now());
+            look.send(context, *worker)?;
         }
         self.prompt_level()
     }
@@ -338,16 +360,16 @@ impl InputLine {
 
     /// Handles a finished look, if it was at this line. It fails with "GPIO line read failed" when no look has
     /// succeeded for [`UNREAD_LIMIT`].
-    pub fn sampled(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(turn, done, false)
+    pub fn sampled(&mut self, context: &Context, done: &mut Done) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, done, false)
     }
 
     /// The same, if a move depends on the input. One failed look is a failure at once.
-    pub fn seen(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(turn, done, true)
+    pub fn seen(&mut self, context: &Context, done: &mut Done) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, done, true)
     }
 
-    fn take_in(&mut self, turn: &Turn, done: &mut Done, at_once: bool) -> Option<Result<Look, Shutdown>> {
+    fn take_in(&mut self, context: &Context, done: &mut Done, at_once: bool) -> Option<Result<Look, Shutdown>> {
         let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
         let Back { result, began, ended, .. } = look.back(done)?;
         let level = match result {
@@ -356,7 +378,9 @@ impl InputLine {
                 self.shown.set(level);
                 Ok(Some(level))
             }
-            Err(failure) if at_once || unread.is_too_long(ended) => turn.try_shut_down(failure.clone()).map(|()| None),
+            Err(failure) if at_once || unread.is_too_long(ended) => {
+                context.try_shut_down(failure.clone()).map(|()| None)
+            }
             Err(_) => Ok(None),
         };
         Some(level.map(|level| Look { level, began, ended }))
@@ -367,14 +391,14 @@ impl InputLine {
     /// # Errors
     ///
     /// "GPIO line read failed" when no look has succeeded for [`UNREAD_LIMIT`].
-    pub fn awaited(&self, turn: &mut Turn) -> Result<(), Shutdown> {
+    pub fn awaited(&self, context: &mut Context) -> Result<(), Shutdown> {
         let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
-        if look.is_here() || !unread.is_too_long(turn.now()) {
+        if look.is_here() || !unread.is_too_long(context.now()) {
             return Ok(());
         }
-        let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.as_ms());
+        let (name, ms) = (context.name(self.pin), UNREAD_LIMIT.as_ms());
         let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
-        turn.try_shut_down(
+        context.try_shut_down(
             stop.remedy("check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART"),
         )
     }
@@ -383,30 +407,12 @@ impl InputLine {
 /// The counter of a line's edges and the worker that reads it, or the reason why there is none.
 pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
 
-impl Mcu {
-    /// The board, to claim a resource. A claim opens files and waits for the guardian. It would delay the steps of a
-    /// configured MCU.
-    ///
-    /// # Errors
-    ///
-    /// "Can't assign oid" after `finalize_config`.
-    pub fn board(&mut self) -> Result<&mut dyn Board, Shutdown> {
-        if self.is_finalized() {
-            return Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, "a pin or bus is claimed after finalize_config"));
-        }
-        Ok(&mut *self.board)
-    }
-
-    /// Claims a line for one more use. It fails after `finalize_config`.
+impl State {
+    /// Claims a line for one more use.
     fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
-        self.board()?;
-        self.claim_at_any_time(pin, direction)
-    }
-
-    fn claim_at_any_time(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         let pin = self.board.canonical(pin);
-        if let Some(place) = self.configuration.claims.iter().position(|claim| claim.pin == pin) {
-            let claim = &mut self.configuration.claims[place];
+        if let Some(place) = self.outputs.find(pin) {
+            let claim = &mut self.outputs.claims[place];
             claim.line.set_direction(direction)?;
             claim.direction = direction;
             claim.shown.begin(direction);
@@ -420,11 +426,32 @@ impl Mcu {
     fn enter(&mut self, pin: Pin, claimed: ClaimedLine, direction: Direction) -> Result<&Claim, Shutdown> {
         let ClaimedLine { line, sleeps_on } = claimed;
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
-        let slow = worker.map(|worker| (worker, Calls::new(self.clock())));
+        let slow = worker.map(|worker| (worker, Calls::new(self.scheduler.clock())));
         let shown = Arc::new(Level::of(direction));
-        let place = self.configuration.claims.len();
-        self.configuration.claims.push(Claim { pin, line, slow, direction, shown });
-        Ok(&self.configuration.claims[place])
+        let claims = &mut self.outputs.claims;
+        claims.push(Claim { pin, line, slow, direction, shown });
+        Ok(&claims[claims.len() - 1])
+    }
+}
+
+impl Context<'_> {
+    /// The board, to claim a resource. A claim opens files and waits for the guardian. It would delay the steps of a
+    /// configured MCU.
+    ///
+    /// # Errors
+    ///
+    /// "Can't assign oid" after `finalize_config`.
+    pub fn board(&mut self) -> Result<&mut dyn Board, Shutdown> {
+        if self.is_finalized() {
+            return Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, "a pin or bus is claimed after finalize_config"));
+        }
+        Ok(&mut *self.state.board)
+    }
+
+    /// Claims a line for one more use. It fails after `finalize_config`.
+    fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
+        self.board()?;
+        self.state.claim(pin, direction)
     }
 
     /// Claims an output and drives it to `level`. It goes to `shutdown_value` when the MCU stops.
@@ -480,9 +507,11 @@ impl Mcu {
             );
             return Err(Shutdown::because(refused, cause).remedy("choose a pin of the processor itself"));
         }
-        let own = self.board.canonical(pin);
-        let claimed = self.configuration.claims.iter().find(|claim| claim.pin == own);
-        claimed.ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
+        let State { board, outputs, .. } = &self.state;
+        let place = outputs.find(board.canonical(pin));
+        place
+            .map(|place| &outputs.claims[place])
+            .ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
     }
 
     /// Claims an output that workers drive, for example a chip select. `level` is also its shutdown value.
@@ -529,13 +558,13 @@ impl Mcu {
     /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
         let own = self.board()?.canonical(pin);
-        if self.configuration.claims.iter().any(|claim| claim.pin == own) {
+        if self.state.outputs.find(own).is_some() {
             return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
         }
-        let CountedLine { line, edges } = self.board.counted_line(own, bias)?;
-        let input = InputLine::new(self.enter(own, line, Direction::Input(bias))?);
+        let CountedLine { line, edges } = self.state.board.counted_line(own, bias)?;
+        let input = InputLine::new(self.state.enter(own, line, Direction::Input(bias))?);
         let edges = match edges {
-            Ok(OnWorker { bus, device }) => Ok((self.workers.start(&bus)?, device)),
+            Ok(OnWorker { bus, device }) => Ok((self.state.workers.start(&bus)?, device)),
             Err(why) => Err(why),
         };
         Ok((input, edges))
@@ -548,11 +577,11 @@ impl Mcu {
     ///
     /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        self.claim_at_any_time(pin, Direction::Input(bias)).map(InputLine::new)
+        self.state.claim(pin, Direction::Input(bias)).map(InputLine::new)
     }
 
     /// The pin's name in the dictionary.
     pub fn name(&self, pin: Pin) -> String {
-        pin.name_in(&self.board.pins())
+        pin.name_in(&self.state.board.pins())
     }
 }

@@ -11,60 +11,63 @@ use std::sync::Arc;
 use crate::board::Board;
 use crate::time::Timing;
 
+mod barrier;
 pub mod base;
 mod batch;
 mod bus;
 mod calls;
 mod command;
 mod configuration;
+mod context;
 mod dialect;
 mod errand;
 mod generation;
-mod hold;
 mod lines;
 mod messages;
 mod moves;
-mod object;
+mod objects;
 mod outbox;
 mod parameters;
+mod phase;
 mod remote;
-mod schedule;
+mod scheduler;
 mod slot;
 mod snapshot;
 mod stats;
 mod stop;
 mod timers;
-mod turn;
 mod wire;
 
 pub use crate::{command, response};
+pub use barrier::Hold;
 pub use batch::Batch;
 pub use bus::{Bus, Conversation, Talk};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
+pub use context::Context;
 pub use dialect::{Dialect, Firmware};
 pub use errand::{Completion, Done, Errand, Job, Parcel, Refused, WorkerId, Workers};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
-pub use hold::Hold;
 pub use lines::{InputLine, Look, OutputLine, PromptLine};
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
-pub use object::{Next, Object, Safe};
+pub use objects::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
-pub use schedule::{Latest, SPIN_MAX};
+pub use scheduler::{Latest, SPIN_MAX};
 pub use slot::{Back, Slot};
 pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;
 pub use timers::Timer;
-pub use turn::Turn;
 pub use wire::{CANBUS_UUID_BYTES, CanHealth, CanNode, CanState, Wire};
 
-use configuration::{Configuration, OBJECTS_MAX};
-use hold::Holds;
-use messages::Spoken;
-use schedule::Schedule;
-use stop::Stop;
+use barrier::Barrier;
+use lines::Outputs;
+use messages::HostWire;
+use objects::{OBJECTS_MAX, Objects};
+use phase::Phase;
+use scheduler::Scheduler;
+use stop::PendingValues;
 use timers::TimerId;
 
 /// The MCU's own responses come first in the list of all responses.
@@ -72,18 +75,23 @@ const fn response_index(format: &str) -> usize {
     place_of_response(&[base::FEATURE], format)
 }
 
-/// The MCU.
+/// The MCU, for the program that runs it: it runs timers, commands and finished jobs.
 pub struct Mcu {
-    /// Counts the free moves.
-    pub moves: MovePool,
-    schedule: Schedule,
+    state: State,
+}
+
+/// The state of the MCU. A feature sees it through its [`Context`]: it cannot run timers or commands.
+struct State {
+    phase: Phase,
+    scheduler: Scheduler,
+    objects: Objects,
+    outputs: Outputs,
+    barrier: Barrier,
+    pending: PendingValues,
+    moves: MovePool,
+    wire: HostWire,
     board: Box<dyn Board>,
     workers: Box<dyn Workers>,
-    outbox: Box<dyn Outbox>,
-    spoken: Spoken,
-    configuration: Configuration,
-    holds: Holds,
-    stop: Stop,
 }
 
 impl Mcu {
@@ -95,18 +103,24 @@ impl Mcu {
         workers: Box<dyn Workers>,
         outbox: Box<dyn Outbox>,
     ) -> Mcu {
-        let mut mcu = Mcu {
+        let mut state = State {
+            phase: Phase::default(),
+            scheduler: Scheduler::new(timing),
+            objects: Objects::default(),
+            outputs: Outputs::default(),
+            barrier: Barrier::default(),
+            pending: PendingValues::default(),
             moves: MovePool::default(),
-            schedule: Schedule::new(timing),
+            wire: HostWire::new(dialect, outbox),
             board,
             workers,
-            outbox,
-            spoken: Spoken { dialect, next: None },
-            configuration: Configuration::default(),
-            holds: Holds::default(),
-            stop: Stop::default(),
         };
-        mcu.send(base::Starting {});
-        mcu
+        state.wire.send(base::Starting {});
+        Mcu { state }
+    }
+
+    /// The context of a command to the MCU itself. A handler that [`command!`] makes passes it on.
+    pub fn context(&mut self) -> Context<'_> {
+        Context::new(&mut self.state, Oid::NONE)
     }
 }

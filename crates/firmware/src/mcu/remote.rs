@@ -5,7 +5,7 @@
 
 use crate::shutdown::Shutdown;
 
-use super::{Back, Done, Errand, Hold, Slot, Turn, WorkerId};
+use super::{Back, Context, Done, Errand, Hold, Slot, WorkerId};
 
 /// An output that can be set to a value.
 pub trait Settable: Send + 'static {
@@ -56,19 +56,19 @@ impl<S: Settable> Remote<S> {
     /// # Errors
     ///
     /// "Bus worker queue overflow".
-    pub fn set(&mut self, turn: &mut Turn, value: S::Value) -> Result<(), Shutdown> {
+    pub fn set(&mut self, context: &mut Context, value: S::Value) -> Result<(), Shutdown> {
         let hold = match self.next.take() {
             Some((_, hold @ Hold(true))) => hold,
-            _ => turn.hold(),
+            _ => context.hold(),
         };
-        self.write(turn, value, hold)
+        self.write(context, value, hold)
     }
 
-    fn write(&mut self, turn: &mut Turn, value: S::Value, hold: Hold) -> Result<(), Shutdown> {
+    fn write(&mut self, context: &mut Context, value: S::Value, hold: Hold) -> Result<(), Shutdown> {
         match self.write.here() {
             Some(write) => {
                 write.value = value;
-                self.write.send_with(turn, self.worker, hold)
+                self.write.send_with(context, self.worker, hold)
             }
             None => {
                 self.next = Some((value, hold));
@@ -78,11 +78,11 @@ impl<S: Settable> Remote<S> {
     }
 
     /// Handles a finished write, if it was to this output. `Ok(true)` means that nothing is left to write.
-    pub fn back(&mut self, turn: &mut Turn, done: &mut Done) -> Option<Result<bool, Shutdown>> {
+    pub fn back(&mut self, context: &mut Context, done: &mut Done) -> Option<Result<bool, Shutdown>> {
         let Back { result, .. } = self.write.back(done)?;
         let result = result.map_err(Shutdown::clone);
         Some(match self.next.take() {
-            Some((next, hold)) => self.write(turn, next, hold).and(result.map(|()| false)),
+            Some((next, hold)) => self.write(context, next, hold).and(result.map(|()| false)),
             None => result.map(|()| true),
         })
     }
@@ -92,10 +92,10 @@ impl<S: Settable> Remote<S> {
     /// # Errors
     ///
     /// The error of the write, for example "PWM write failed", unless the MCU is stopped.
-    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
-        match self.back(turn, done) {
-            Some(Ok(true)) => turn.is_safe(),
-            Some(Err(failure)) => return turn.device_failed(kind, failure),
+    pub fn settle(&mut self, context: &mut Context, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
+        match self.back(context, done) {
+            Some(Ok(true)) => context.is_safe(),
+            Some(Err(failure)) => return context.device_failed(kind, failure),
             _ => {}
         }
         Ok(())

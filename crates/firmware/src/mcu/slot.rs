@@ -12,7 +12,7 @@ use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
 use super::errand::{Job, Parcel, Refused};
-use super::{Done, Errand, Hold, Turn, WorkerId};
+use super::{Context, Done, Errand, Hold, WorkerId};
 
 /// The place of an errand. The errand is here or with a worker.
 pub struct Slot<E: Errand>(Place<E>);
@@ -94,24 +94,24 @@ impl<E: Errand> Slot<E> {
     /// # Errors
     ///
     /// "Bus worker queue overflow".
-    pub fn send(&mut self, turn: &mut Turn, worker: WorkerId) -> Result<(), Shutdown> {
+    pub fn send(&mut self, context: &mut Context, worker: WorkerId) -> Result<(), Shutdown> {
         if !self.is_here() {
             return Ok(());
         }
-        let hold = turn.hold();
-        self.send_with(turn, worker, hold)
+        let hold = context.hold();
+        self.send_with(context, worker, hold)
     }
 
     /// The same, with a hold that the sender already has.
-    pub(super) fn send_with(&mut self, turn: &mut Turn, worker: WorkerId, hold: Hold) -> Result<(), Shutdown> {
+    pub(super) fn send_with(&mut self, context: &mut Context, worker: WorkerId, hold: Hold) -> Result<(), Shutdown> {
         let Place::Here(packed) = &self.0 else { return Ok(()) };
         let away = Place::Away { address: address(&**packed), counts: true };
         let Place::Here(parcel) = mem::replace(&mut self.0, away) else { return Ok(()) };
-        match turn.submit(worker, Job { oid: turn.oid(), parcel, holds: hold.0 }) {
+        match context.submit(worker, Job { oid: context.oid(), parcel, holds: hold.0 }) {
             Ok(()) => Ok(()),
             Err(Refused { job, why }) => {
                 self.put_back(job.parcel);
-                turn.release(hold);
+                context.release(hold);
                 Err(why)
             }
         }

@@ -14,7 +14,7 @@ use crate::lateness::Lateness;
 use crate::shutdown::ShutdownReason;
 use crate::time::Clock;
 
-use super::{DialectName, Mcu, OBJECTS_MAX, Oid};
+use super::{DialectName, Mcu, OBJECTS_MAX, Oid, State};
 
 /// Highest number of lines in a snapshot.
 const LINES_MAX: usize = 512;
@@ -221,7 +221,8 @@ impl Mcu {
     /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
     /// begins again if lines or objects came or went meanwhile. It does not allocate.
     pub fn tell(&self, to: &mut Snapshot) -> bool {
-        let shape = (self.configuration.claims.len(), self.configuration.objects.len());
+        let State { outputs, objects, workers, .. } = &self.state;
+        let shape = (outputs.len(), objects.len());
         if to.told == 0 || to.shape != shape {
             to.shape = shape;
             to.told = 1;
@@ -232,7 +233,7 @@ impl Mcu {
         let next = (first + ROWS).min(rows);
         for row in first..next {
             match row.checked_sub(shape.0) {
-                None => append(&mut to.lines, self.configuration.claims[row].state()),
+                None => append(&mut to.lines, outputs.state(row)),
                 Some(index) => {
                     if let Some(state) = self.object_state(index) {
                         append(&mut to.objects, state);
@@ -245,7 +246,7 @@ impl Mcu {
             return false;
         }
         let queues = &mut to.queues;
-        self.workers.tell(&mut |bus, waiting| {
+        workers.tell(&mut |bus, waiting| {
             let mut name = [0; NAME_BYTES];
             name.iter_mut().zip(bus.bytes()).for_each(|(to, from)| *to = from);
             append(queues, QueueState { name, waiting });
@@ -254,32 +255,32 @@ impl Mcu {
     }
 
     fn tell_head(&self, to: &mut Snapshot) {
-        to.at = self.schedule.last_read;
-        to.is_configured = self.is_finalized();
-        to.oids_allocated = self.is_allocated();
-        to.dialect = Some(self.spoken.dialect.name());
-        let last = self.last_stop();
-        let at = last.map_or(self.schedule.last_read, |(_, at)| at);
-        to.stopped = self.stop.reason.map(|reason| (reason, at));
-        match last {
-            Some((stop, _)) => put(&mut to.detail, &stop.trouble),
+        let State { phase, scheduler, wire, moves, .. } = &self.state;
+        to.at = scheduler.last_read();
+        to.is_configured = phase.is_finalized();
+        to.oids_allocated = phase.is_allocated();
+        to.dialect = Some(wire.dialect().name());
+        to.stopped = phase.last_stop().map(|(why, at)| (why.reason, at));
+        match phase.last_stop() {
+            Some((why, _)) => put(&mut to.detail, &why.trouble),
             None => to.detail.clear(),
         }
         put(&mut to.debtor, self.debtor().unwrap_or_default());
         to.is_held = self.is_held();
-        to.moves = self.moves.used();
-        to.lateness.clone_from(&self.schedule.lateness);
+        to.moves = moves.used();
+        to.lateness.clone_from(scheduler.lateness());
         to.lines.clear();
         to.objects.clear();
         to.queues.clear();
     }
 
     fn object_state(&self, index: usize) -> Option<ObjectState> {
-        let object = self.configuration.objects.get(index)?.as_ref()?;
+        let oid = Oid::at(index);
+        let object = self.state.objects.get(oid)?;
         Some(ObjectState {
             oid: (index < Oid::FIRST_OWN).then_some(index as u8),
             kind: object.kind(),
-            pin: self.configuration.pins.iter().find(|(oid, _)| oid.index() == index).map(|(_, pin)| *pin),
+            pin: self.state.objects.pin(oid),
             report: object.report(),
             bus: object.counts(),
         })

@@ -9,10 +9,10 @@
 
 #![forbid(unsafe_code)]
 
-use crate::shutdown::{Shutdown, ShutdownReason, reason};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks};
 
-use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
+use super::{Context, Mcu, Note, Oid, Safe, State, TimerId, base};
 
 #[cfg(doc)]
 use super::Object;
@@ -24,13 +24,9 @@ pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 /// guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// The reason of a stop, and the shutdown values that are still owed.
+/// The shutdown values that are still owed.
 #[derive(Default)]
-pub(super) struct Stop {
-    /// Why the MCU is stopped; `None` while it is not.
-    pub(super) reason: Option<ShutdownReason>,
-    /// The last stop, and its time.
-    pub(super) last: Option<(Shutdown, Clock)>,
+pub(super) struct PendingValues {
     /// Whether `shut_down` is running. A failure meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
@@ -50,122 +46,55 @@ struct Debt {
     given_up: bool,
 }
 
-impl Mcu {
-    /// Whether the MCU is stopped.
-    pub fn is_shutdown(&self) -> bool {
-        self.stop.reason.is_some()
+impl PendingValues {
+    /// Whether the MCU waits for any of them.
+    #[inline]
+    pub(super) fn are_awaited(&self) -> bool {
+        self.owed.iter().any(|debt| !debt.given_up)
     }
+}
 
-    /// Why and when the MCU stopped; `None` while it is not stopped.
-    pub fn last_stop(&self) -> Option<(&Shutdown, Clock)> {
-        self.stop.last.as_ref().filter(|_| self.is_shutdown()).map(|(stop, at)| (stop, *at))
-    }
-
-    /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
-    /// that is already stopped does this again and keeps its first reason.
-    pub fn shut_down(&mut self, shutdown: Shutdown) {
-        if self.stop.under_way {
-            self.outbox.note(Note::Trouble(&shutdown));
-            return;
-        }
-        let clock = self.now();
-        let first = self.stop.reason.is_none();
-        let reason = *self.stop.reason.get_or_insert(shutdown.reason);
-        self.stop.under_way = true;
-        if first {
-            self.stop.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
-        }
-        self.schedule.timers.clear();
-        for oid in self.oids() {
-            if let Some(mut object) = self.take(oid) {
-                object.shutdown(&mut Turn::new(self, oid));
-                self.put_back(oid, object);
-            }
-        }
-        for oid in self.oids() {
-            self.make_safe(oid);
-        }
-        self.stop.under_way = false;
-        self.retry_later();
-        let static_string_id = self.spoken.dialect.static_string_id(reason);
-        self.send(base::ShutdownReport { clock, static_string_id });
-        if first {
-            self.outbox.note(Note::Shutdown(&shutdown));
-            self.stop.last = Some((shutdown, clock));
-        } else if shutdown.reason != reason {
-            // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
-            self.outbox.note(Note::Trouble(&shutdown));
-        }
-    }
-
-    /// Returns the given shutdown as an error, which then stops the MCU. Returns `Ok` if the MCU is already stopped
-    /// (the firmware's `try_shutdown`).
-    ///
-    /// # Errors
-    ///
-    /// `shutdown`, unless the MCU is stopped.
-    pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
-        match self.stop.reason {
-            Some(_) => Ok(()),
-            None => Err(shutdown),
-        }
-    }
-
-    /// See [`Turn::device_failed`].
+impl State {
+    /// See [`Context::device_failed`].
     pub(super) fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
-        if self.stop.reason.is_none() {
+        if !self.phase.is_stopped() {
             return Err(shutdown);
         }
-        let known = self.stop.owed.iter_mut().find(|debt| debt.oid == oid);
+        let known = self.pending.owed.iter_mut().find(|debt| debt.oid == oid);
         let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
         // It is retried twenty times a second, but logged once.
         if !again {
             let trouble = self.blame(shutdown, kind, oid);
-            self.outbox.note(Note::Trouble(&trouble));
+            self.wire.note(Note::Trouble(&trouble));
         }
         self.retry_later();
         Ok(())
     }
 
-    /// See [`Turn::warn`].
+    /// See [`Context::warn`].
     pub(super) fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
         let trouble = self.blame(trouble, kind, oid);
-        self.outbox.note(Note::Warning(&trouble));
+        self.wire.note(Note::Warning(&trouble));
     }
 
-    /// See [`Turn::is_safe`].
+    /// See [`Context::is_safe`].
     pub(super) fn is_safe(&mut self, oid: Oid) {
-        let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };
-        let debt = self.stop.owed.swap_remove(place);
+        let Some(place) = self.pending.owed.iter().position(|debt| debt.oid == oid) else { return };
+        let debt = self.pending.owed.swap_remove(place);
         if debt.failed {
-            self.outbox.note(Note::Safe(&debt.name));
+            self.wire.note(Note::Safe(&debt.name));
         }
     }
 
-    /// The log's name of an object that owes its shutdown value; `None` if nothing is owed.
-    pub fn debtor(&self) -> Option<&str> {
-        self.stop.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
-    }
-
-    /// Whether any shutdown value is owed.
-    #[inline]
-    pub fn owes(&self) -> bool {
-        self.stop.owed.iter().any(|debt| !debt.given_up)
-    }
-
-    fn oids(&self) -> impl Iterator<Item = Oid> + use<> {
-        (0..self.configuration.objects.len()).map(Oid::at)
-    }
-
     fn make_safe(&mut self, oid: Oid) {
-        let Some(mut object) = self.take(oid) else { return };
-        let safe = object.make_safe(&mut Turn::new(self, oid));
+        let Some(mut object) = self.objects.take(oid) else { return };
+        let safe = object.make_safe(&mut Context::new(self, oid));
         let (kind, guarded) = (object.kind(), object.is_guarded());
-        self.put_back(oid, object);
-        if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {
+        self.objects.put_back(oid, object);
+        if !matches!(safe, Ok(Safe::Now)) && !self.pending.owed.iter().any(|debt| debt.oid == oid) {
             let name = self.name_object(kind, oid);
-            let since = self.schedule.last_read;
-            self.stop.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
+            let since = self.scheduler.last_read();
+            self.pending.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
             Ok(Safe::Now) => self.is_safe(oid),
@@ -180,18 +109,18 @@ impl Mcu {
     /// Starts the timer of the next attempt. It is needed if a shutdown value could not be written, or if the MCU will
     /// stop waiting for one.
     fn retry_later(&mut self) {
-        if self.stop.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
-            self.schedule.timers.remove(TimerId::RETRY);
-            let at = self.schedule.last_read + RETRY_TICKS;
-            self.schedule.timers.insert(at, TimerId::RETRY);
+        if self.pending.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
+            self.scheduler.cancel(TimerId::RETRY);
+            let at = self.scheduler.last_read() + RETRY_TICKS;
+            self.scheduler.start(TimerId::RETRY, at);
         }
     }
 
     /// Retries the shutdown values that could not be written. It stops waiting for overdue ones that the guardian
     /// cannot write.
     pub(super) fn retry(&mut self) {
-        let now = self.now();
-        for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
+        let now = self.scheduler.now();
+        for debt in self.pending.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
             if now.since(debt.since) >= i64::from(UNGUARDED_LIMIT.0) {
                 debt.given_up = true;
                 let cause = format!(
@@ -200,24 +129,81 @@ impl Mcu {
                     UNGUARDED_LIMIT.as_ms()
                 );
                 let stop = Shutdown::because(reason::BUS_HANGS, cause);
-                self.outbox.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
+                self.wire.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
             }
         }
-        for place in (0..self.stop.owed.len()).rev() {
-            let failed = self.stop.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
+        for place in (0..self.pending.owed.len()).rev() {
+            let failed = self.pending.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
             if let Some(oid) = failed {
                 self.make_safe(oid);
             }
         }
         self.retry_later();
     }
+}
+
+impl Mcu {
+    /// Whether the MCU is stopped.
+    pub fn is_shutdown(&self) -> bool {
+        self.state.phase.is_stopped()
+    }
+
+    /// Why and when the MCU stopped; `None` while it is not stopped.
+    pub fn last_stop(&self) -> Option<(&Shutdown, Clock)> {
+        self.state.phase.last_stop()
+    }
+
+    /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
+    /// that is already stopped does this again and keeps its first reason.
+    pub fn shut_down(&mut self, shutdown: Shutdown) {
+        let state = &mut self.state;
+        if state.pending.under_way {
+            state.wire.note(Note::Trouble(&shutdown));
+            return;
+        }
+        let clock = state.scheduler.now();
+        let again = state.phase.stop(shutdown, clock);
+        state.pending.under_way = true;
+        if again.is_none() {
+            state.pending.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
+        }
+        state.scheduler.clear();
+        for oid in state.objects.oids() {
+            if let Some(mut object) = state.objects.take(oid) {
+                object.shutdown(&mut Context::new(state, oid));
+                state.objects.put_back(oid, object);
+            }
+        }
+        for oid in state.objects.oids() {
+            state.make_safe(oid);
+        }
+        state.pending.under_way = false;
+        state.retry_later();
+        let Some((why, _)) = state.phase.last_stop() else { return };
+        let static_string_id = state.wire.dialect().static_string_id(why.reason);
+        state.wire.send(base::ShutdownReport { clock, static_string_id });
+        match again {
+            None => state.wire.note(Note::Shutdown(why)),
+            // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
+            Some(again) if again.reason == why.reason => {}
+            Some(again) => state.wire.note(Note::Trouble(&again)),
+        }
+    }
+
+    /// The log's name of an object that owes its shutdown value; `None` if nothing is owed.
+    pub fn debtor(&self) -> Option<&str> {
+        self.state.pending.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
+    }
+
+    /// Whether any shutdown value is owed.
+    #[inline]
+    pub fn owes(&self) -> bool {
+        self.state.pending.are_awaited()
+    }
 
     pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
-        if self.stop.reason.take().is_none() {
-            let what = "clear_shutdown came while the MCU was not stopped";
-            return Err(Shutdown::by_host(reason::NOT_SHUTDOWN, what));
-        }
-        self.hold_again();
+        self.state.phase.clear_shutdown()?;
+        self.state.hold_again();
         Ok(())
     }
 }

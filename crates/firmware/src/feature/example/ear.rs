@@ -6,7 +6,7 @@
 use crate::board::{BusDevice, BusError};
 use crate::feature::spi::{Spi, spi_shutdown};
 use crate::mcu::{
-    Back, Command, Conversation, Done, Feature, Next, Object, Oid, Response, Slot, Talk, Timer, Turn, WireClock,
+    Back, Command, Context, Conversation, Done, Feature, Next, Object, Oid, Response, Slot, Talk, Timer, WireClock,
     command, response,
 };
 use crate::shutdown::Shutdown;
@@ -50,21 +50,21 @@ struct Ear {
     rest_ticks: Ticks,
 }
 
-const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
-    mcu.require::<Spi>(spi_oid)?;
-    mcu.assign(oid, Ear { spi: spi_oid, listen: Slot::talking(Listen), rest_ticks: Ticks(0) })
+const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |context, oid: Oid, spi_oid: Oid| {
+    context.require::<Spi>(spi_oid)?;
+    context.assign(oid, Ear { spi: spi_oid, listen: Slot::talking(Listen), rest_ticks: Ticks(0) })
 });
 
 const QUERY_EAR: Command =
-    command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, turn, clock: WireClock, rest_ticks: Ticks| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, context, clock: WireClock, rest_ticks: Ticks| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         ear.listen.drop_pending();
         ear.rest_ticks = rest_ticks;
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     });
 
 impl Object for Ear {
@@ -72,23 +72,23 @@ impl Object for Ear {
         "ear"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if self.listen.is_here() {
-            self.listen.converse(turn, self.spi)?;
+            self.listen.converse(context, self.spi)?;
         }
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
         let Some(Back { result, counts: true, .. }) = self.listen.back(done) else { return Ok(()) };
         match result {
-            Ok(loudness) => turn.send(Heard { oid: turn.oid(), loudness }),
-            Err(error) => return turn.try_shut_down(spi_shutdown(error.clone())),
+            Ok(loudness) => context.send(Heard { oid: context.oid(), loudness }),
+            Err(error) => return context.try_shut_down(spi_shutdown(error.clone())),
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.listen.drop_pending();
     }
 }

@@ -18,7 +18,7 @@ use pinion_sync::watch::Watch;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::between_ticks;
-use crate::mcu::{Errand, Mcu};
+use crate::mcu::{Context, Errand};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
@@ -56,7 +56,7 @@ pub(super) struct Shift {
 
 impl Shift {
     pub(super) fn new(
-        mcu: &Mcu,
+        context: &Context,
         sclk_pin: Pin,
         sclk: Arc<dyn Line>,
         dout: Arc<dyn Line>,
@@ -64,7 +64,16 @@ impl Shift {
         watcher: Option<&Watcher>,
     ) -> Shift {
         let watch = watcher.map(|watcher| watcher.watch.clone());
-        Shift { sclk, dout, pulses, time: mcu.clock(), watch, announced: 0, name: mcu.name(sclk_pin), told: false }
+        Shift {
+            sclk,
+            dout,
+            pulses,
+            time: context.clock(),
+            watch,
+            announced: 0,
+            name: context.name(sclk_pin),
+            told: false,
+        }
     }
 
     pub(super) fn run(&mut self) -> Result<Shifted, Shutdown> {
@@ -156,8 +165,8 @@ pub(super) struct Watcher {
 }
 
 impl Watcher {
-    pub(super) fn new(mcu: &Mcu, sclk: Arc<dyn Line>) -> Watcher {
-        Watcher { sclk, time: mcu.clock(), watch: Arc::default() }
+    pub(super) fn new(context: &Context, sclk: Arc<dyn Line>) -> Watcher {
+        Watcher { sclk, time: context.clock(), watch: Arc::default() }
     }
 }
 

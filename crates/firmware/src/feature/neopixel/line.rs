@@ -19,7 +19,7 @@ use log::warn;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::Pace;
-use crate::mcu::Mcu;
+use crate::mcu::Context;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
@@ -91,14 +91,14 @@ impl Pulses {
     ///
     /// "Not an output pin" if the line has no registers or the clock is too coarse, "Invalid neopixel data_size".
     pub(super) fn new(
-        mcu: &Mcu,
+        context: &Context,
         pin: Pin,
         line: Arc<dyn Line>,
         size: usize,
         bit_max: Ticks,
         reset: Ticks,
     ) -> Result<Pulses, Shutdown> {
-        let name = mcu.name(pin);
+        let name = context.name(pin);
         let refused = |why: &str, or: &str| {
             let cause = format!("{name} cannot drive LEDs: {why}");
             Shutdown::because(reason::NOT_OUTPUT, cause).remedy(format!("{TO_SPI}{or}"))
@@ -111,7 +111,7 @@ impl Pulses {
             let why = "their pulses are too short for a program on Linux";
             return Err(refused(why, OR_TO_FAST_LINE));
         }
-        let clock = mcu.clock();
+        let clock = context.clock();
         let Some(limits) = Limits::of(&*clock, bit_max) else {
             let why = format!("the computer's clock has steps of {} ns, too long for their pulses", clock.step_ns());
             return Err(refused(&why, ""));
@@ -120,7 +120,7 @@ impl Pulses {
             let cause = format!("a chain of {size} bytes is too long for a line, which takes {SIZE_MAX}");
             return Err(Shutdown::because(INVALID_SIZE, cause).remedy("lower chain_count").of(&name));
         }
-        let pace = Pace::new(mcu);
+        let pace = Pace::new(context);
         let free_at = pace.now() + reset;
         Ok(Pulses { line, pace, limits, reset, free_at, name, told: false })
     }
