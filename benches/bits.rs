@@ -16,7 +16,7 @@ use pinion_firmware::board::{
 };
 use pinion_firmware::lateness::Lateness;
 use pinion_firmware::mcu::{
-    Completion, Dialect, DialectName, Generation, Job, Mcu, Note, Outbox, Refused, WorkerId, Workers,
+    Dialect, DialectName, FinishedJob, Generation, Mcu, Note, Outbox, Refused, SentJob, WorkerId, Workers,
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
@@ -264,10 +264,10 @@ struct Threads {
     clock: Arc<dyn TimeSource>,
     are_parallel: bool,
     /// By the names of their buses.
-    workers: Vec<(String, Sender<Job>)>,
-    outbox: Sender<Completion>,
-    done: Mutex<Receiver<Completion>>,
-    waiting: Mutex<Option<Completion>>,
+    workers: Vec<(String, Sender<SentJob>)>,
+    outbox: Sender<FinishedJob>,
+    done: Mutex<Receiver<FinishedJob>>,
+    waiting: Mutex<Option<FinishedJob>>,
 }
 
 impl Threads {
@@ -282,14 +282,14 @@ impl Workers for Threads {
         if let Some(worker) = self.workers.iter().position(|(name, _)| name == bus) {
             return Ok(WorkerId(worker));
         }
-        let (jobs, inbox) = mpsc::channel::<Job>();
+        let (jobs, inbox) = mpsc::channel::<SentJob>();
         let (clock, outbox) = (self.clock.clone(), self.outbox.clone());
         thread::spawn(move || {
             realtime::enter(Role::Worker);
-            for Job { oid, mut parcel, holds } in inbox {
+            for mut job in inbox {
                 let began = clock.now();
-                parcel.run();
-                let _ = outbox.send(Completion { oid, parcel, holds, began, ended: clock.now() });
+                job.run();
+                let _ = outbox.send(FinishedJob { job, began, ended: clock.now() });
             }
         });
         self.workers.push((bus.into(), jobs));
@@ -298,10 +298,10 @@ impl Workers for Threads {
     fn are_parallel(&self) -> bool {
         self.are_parallel
     }
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), Refused> {
         self.workers[worker].1.send(job).map_err(|error| panic!("the worker ended: {error}"))
     }
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<FinishedJob> {
         self.waiting.lock().unwrap().take()
     }
     fn has_completion(&self) -> bool {

@@ -10,7 +10,7 @@ use pinion_firmware::board::{
     self, Adc, Bank, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges,
     I2cConfig, Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
-use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
+use pinion_firmware::mcu::{FinishedJob, Refused, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
@@ -848,8 +848,8 @@ struct UnderWay {
 }
 
 enum Work {
-    ToDo(Job),
-    Done(Completion),
+    ToDo(SentJob),
+    Done(FinishedJob),
 }
 
 impl Shop {
@@ -902,7 +902,7 @@ impl Workers for FakeWorkers {
         })))
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: SentJob) -> Result<(), Refused> {
         if self.bench.state().refuses {
             return Err(Refused { job, why: Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it") });
         }
@@ -914,10 +914,9 @@ impl Workers for FakeWorkers {
         let mut end = begin + takes;
         let work = if at_once {
             self.bench.state().bus_now = Some(end);
-            job.parcel.run();
+            job.run();
             end = self.bench.state().bus_now.take().unwrap_or(end);
-            let Job { oid, parcel, holds } = job;
-            Work::Done(Completion { oid, parcel, holds, began: begin, ended: end })
+            Work::Done(FinishedJob { job, began: begin, ended: end })
         } else {
             Work::ToDo(job)
         };
@@ -928,26 +927,26 @@ impl Workers for FakeWorkers {
 
     /// An errand calls its device at its own end, unless bytes take time. An errand that keeps time itself goes on from
     /// there in a time of its own. It is finished when that time has come.
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<FinishedJob> {
         while self.has_completion() {
             let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
-            let Job { oid, mut parcel, holds } = match work {
+            let mut job = match work {
                 Work::ToDo(job) => job,
-                Work::Done(completion) => return Some(completion),
+                Work::Done(finished) => return Some(finished),
             };
             let ago = Ticks(self.bench.clock.now().since(end) as u32);
             self.bench.state().on_worker = true;
             self.bench.ago.store(ago.0, Ordering::Relaxed);
             // A worker may take memory, for example for the words of what failed.
-            let ended = uncounted(|| self.bench.clock.errand(&mut || parcel.run())) - ago;
+            let ended = uncounted(|| self.bench.clock.errand(&mut || job.run())) - ago;
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {
-                return Some(Completion { oid, parcel, holds, began, ended });
+                return Some(FinishedJob { job, began, ended });
             }
             let mut shop = self.shop.lock().unwrap();
             shop.delay(worker, ended, Ticks(ended.since(end) as u32));
-            let work = Work::Done(Completion { oid, parcel, holds, began, ended });
+            let work = Work::Done(FinishedJob { job, began, ended });
             shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
         None

@@ -6,7 +6,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Done, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Safe, Timer, WireClock, command,
+    Command, Context, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Timer, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -49,7 +49,6 @@ const KIND: &str = "digital output";
 
 struct DigitalOut {
     line: OutputLine,
-    shutdown_value: bool,
     max_duration: Ticks,
     cycle: Ticks,
     queue: MoveQueue<Move>,
@@ -75,7 +74,7 @@ impl DigitalOut {
         self.line.write(context, on)?;
         self.on = on;
         self.toggling = on && on_ticks < self.cycle;
-        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.shutdown_value);
+        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.line.shutdown_value(context));
         self.end = limited.then(|| at + self.max_duration);
         if let Some(next) = self.queue.first() {
             if self.end.is_some_and(|end| end < next.at) {
@@ -101,7 +100,7 @@ impl DigitalOut {
 
     /// Makes the edge of a pulse, which was due at `at`.
     fn toggle(&mut self, context: &mut Context, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle(context)?;
+        self.line.write(context, !self.on)?;
         self.on = !self.on;
         let mut next = at + if self.on { self.on_ticks } else { self.off_ticks };
         if let Some(end) = self.end
@@ -152,7 +151,7 @@ impl DigitalOut {
         self.on = value;
         self.toggling = false;
         self.end = None;
-        if value != self.shutdown_value && self.max_duration.0 != 0 {
+        if value != self.line.shutdown_value(context) && self.max_duration.0 != 0 {
             let end = context.now() + self.max_duration;
             self.end = Some(end);
             self.phase = Phase::Load;
@@ -175,23 +174,15 @@ impl Object for DigitalOut {
         }
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        self.line.settle(context, KIND, done)
-    }
-
     fn report(&self) -> Report {
         Report { queued: self.queue.len(), value: None }
     }
 
     fn shutdown(&mut self, context: &mut Context) {
-        self.on = self.shutdown_value;
+        self.on = self.line.shutdown_value(context);
         self.toggling = false;
         self.end = None;
         self.queue.clear(context.moves());
-    }
-
-    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
-        self.line.make_safe(context, self.shutdown_value)
     }
 }
 
@@ -210,7 +201,7 @@ impl SetLines {
     /// # Errors
     ///
     /// "Unable to open out GPIO chip line" for a line that is refused, or for the 257th line; the errors of
-    /// [`Mcu::output`](crate::mcu::Mcu::output); "GPIO line write failed".
+    /// [`Context::kept_output`]; "GPIO line write failed".
     fn set(&mut self, context: &mut Context, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
@@ -218,14 +209,14 @@ impl SetLines {
             _ if context.is_finalized() => Err(set_too_late(context, reason::OUTPUT_LINE, "set_digital_out", pin)),
             // Claim the line again, so that the guardian learns the new level.
             Some(place) => {
-                self.0[place].1 = context.output(pin, value, value)?;
+                self.0[place].1 = context.kept_output(pin, value)?;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::OUTPUT_LINE, "set_digital_out wants more than 256 lines"))
             }
             None => {
-                self.0.push((pin, context.output(pin, value, value)?));
+                self.0.push((pin, context.kept_output(pin, value)?));
                 Ok(())
             }
         }
@@ -236,11 +227,6 @@ impl Object for SetLines {
     fn kind(&self) -> &'static str {
         "set_digital_out"
     }
-
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let mut lines = self.0.iter_mut();
-        lines.try_for_each(|(_, line)| line.settle(context, "set_digital_out", done))
-    }
 }
 
 const CONFIG_DIGITAL_OUT: Command = command!(
@@ -250,7 +236,6 @@ const CONFIG_DIGITAL_OUT: Command = command!(
         let line = context.output(pin, value, default_value)?;
         let output = DigitalOut {
             line,
-            shutdown_value: default_value,
             max_duration,
             cycle: Ticks(0),
             queue: MoveQueue::default(),

@@ -9,7 +9,7 @@ use std::ops::Range;
 use crate::board::Pin;
 use crate::mcu::{
     Batch, Command, Constant, Context, Feature, Generation::Kalico, Generation::V0_13, MoveQueue, Next, Object, Oid,
-    Present, PromptLine, Report, Response, SPIN_MAX, Safe, Timer, WireClock, command, response, since,
+    Present, PromptLine, Report, Response, SPIN_MAX, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -109,7 +109,7 @@ struct Stepper {
     step: PromptLine,
     dir: PromptLine,
     /// The step pin's idle level.
-    invert_step: bool,
+    idle_step: bool,
     /// Every edge is a step. Otherwise an edge back follows each step.
     both_edges: bool,
     /// The shortest time between two edges. Zero if it is shorter than a [`CALL`] that makes an edge.
@@ -253,7 +253,7 @@ impl Stepper {
     fn idle(&mut self) -> Result<(), Shutdown> {
         let dir = self.dir.write(false);
         if !self.both_edges {
-            self.step.write(self.invert_step)?;
+            self.step.write(self.idle_step)?;
         }
         dir
     }
@@ -336,25 +336,22 @@ impl Object for Stepper {
         let position = self.position().wrapping_sub(POSITION_BIAS) as i32;
         Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
     }
-
-    fn make_safe(&mut self, _context: &mut Context) -> Result<Safe, Shutdown> {
-        self.idle().map(|()| Safe::Now)
-    }
 }
 
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
     |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
         context.vacant(oid)?;
-        let idle = invert_step > 0;
-        let step = context.prompt_output(step_pin, "step", idle, idle)?;
+        let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
+        // After a step on either edge, a stop leaves the level: another edge would be another step.
+        let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
         let dir = context.prompt_output(dir_pin, "dir", false, false)?;
         let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
         let stepper = Stepper {
             step,
             dir,
-            invert_step: idle,
-            both_edges: invert_step < 0,
+            idle_step,
+            both_edges,
             pulse_ticks,
             late_limit: context.step_late_limit(),
             queue: MoveQueue::default(),

@@ -31,7 +31,7 @@ impl Mcu {
         state.phase.finalize(crc)?;
         state.moves.finalize();
         // The core does not allocate after this.
-        state.scheduler.finalize(state.outputs.has_banks());
+        state.scheduler.finalize(state.lines.has_banks());
         let mut kinds: Vec<(&'static str, usize)> = Vec::new();
         for object in state.objects.iter() {
             match kinds.iter_mut().find(|(kind, _)| *kind == object.kind()) {
@@ -63,7 +63,7 @@ impl Mcu {
         state.workers.reset();
         state.barrier = Default::default();
         state.objects = Default::default();
-        state.outputs = Default::default();
+        state.lines = Default::default();
         state.board.reset();
         state.moves = Default::default();
         state.wire.take_next();

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
+use super::stop::Subject;
 use super::{Dialect, Generations, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 
 /// What a feature may do in a call. The timers and jobs that an object starts here are its own.
@@ -25,7 +26,11 @@ impl<'a> Context<'a> {
         Context { state, oid }
     }
 
-    /// The object that is called.
+    pub(super) fn set_oid(&mut self, oid: Oid) {
+        self.oid = oid;
+    }
+
+    /// The object that is called or configured.
     #[inline]
     pub fn oid(&self) -> Oid {
         self.oid
@@ -146,7 +151,11 @@ impl<'a> Context<'a> {
     ///
     /// The failure, unless the MCU is stopped.
     pub fn device_failed(&mut self, kind: &str, failure: Shutdown) -> Result<(), Shutdown> {
-        self.state.device_failed(self.oid, kind, failure)
+        if !self.is_shutdown() {
+            return Err(failure);
+        }
+        self.state.note_failure(Subject::Object(self.oid), Some(kind), failure);
+        Ok(())
     }
 
     /// Logs a failure of the object that does not stop the MCU.
@@ -157,7 +166,7 @@ impl<'a> Context<'a> {
     /// Call this after answering [`Safe::Later`](super::Safe::Later), when the object's outputs are at their shutdown
     /// values.
     pub fn is_safe(&mut self) {
-        self.state.is_safe(self.oid);
+        self.state.is_safe(Subject::Object(self.oid));
     }
 
     /// Makes further commands wait for this object until [`Context::release`]. It has an effect only if a command runs

@@ -38,32 +38,59 @@ pub trait Parcel: Any + Send {
     fn run(&mut self);
 }
 
-/// An errand on its way to a worker.
-pub struct Job {
+/// An errand on its way to a worker and back.
+pub struct SentJob {
     /// The object that sent it.
-    pub oid: Oid,
-    /// The work.
-    pub parcel: Box<dyn Parcel>,
+    oid: Oid,
+    /// The place of the object's output that it writes, if it does that.
+    output: Option<usize>,
+    parcel: Box<dyn Parcel>,
+    holds: bool,
+}
+
+impl SentJob {
+    /// Work for an object. `holds`: commands wait for its return.
+    pub fn new(oid: Oid, parcel: Box<dyn Parcel>, holds: bool) -> SentJob {
+        SentJob { oid, output: None, parcel, holds }
+    }
+
+    /// The same, for an output of the object.
+    pub(super) fn to_output(self, output: Option<usize>) -> SentJob {
+        SentJob { output, ..self }
+    }
+
+    /// The object that sent it.
+    pub fn oid(&self) -> Oid {
+        self.oid
+    }
+
     /// Whether commands wait for its return.
-    pub holds: bool,
+    pub fn holds(&self) -> bool {
+        self.holds
+    }
+
+    /// Does the work, and keeps its result. Runs on a worker.
+    pub fn run(&mut self) {
+        self.parcel.run();
+    }
+
+    pub(super) fn into_parcel(self) -> Box<dyn Parcel> {
+        self.parcel
+    }
 }
 
 /// A job that a worker cannot accept, and the reason.
 pub struct Refused {
     /// The job, for its sender.
-    pub job: Job,
+    pub job: SentJob,
     /// "Bus worker queue overflow".
     pub why: Shutdown,
 }
 
 /// An errand that is done, on its way back from its worker.
-pub struct Completion {
-    /// The object that sent it.
-    pub oid: Oid,
+pub struct FinishedJob {
     /// The work and its result.
-    pub parcel: Box<dyn Parcel>,
-    /// Whether commands wait for it.
-    pub holds: bool,
+    pub job: SentJob,
     /// When the worker began the work.
     pub began: Clock,
     /// When the worker finished the work.
@@ -106,10 +133,10 @@ pub trait Workers: Send {
     /// # Errors
     ///
     /// The job, if the worker cannot accept it.
-    fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Refused>;
+    fn submit(&mut self, worker: WorkerId, job: SentJob) -> Result<(), Refused>;
 
     /// The next finished errand. The errands of one bus finish in the order in which they were sent.
-    fn completion(&mut self) -> Option<Completion>;
+    fn completion(&mut self) -> Option<FinishedJob>;
 
     /// Whether [`Workers::completion`] has one.
     fn has_completion(&self) -> bool;
@@ -122,7 +149,7 @@ pub trait Workers: Send {
 }
 
 impl Context<'_> {
-    pub(super) fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Refused> {
+    pub(super) fn submit(&mut self, worker: WorkerId, job: SentJob) -> Result<(), Refused> {
         self.state.workers.submit(worker, job)
     }
 
@@ -169,19 +196,26 @@ impl Mcu {
         self.reset_if_due();
     }
 
-    fn give_back(&mut self, completion: Completion) {
-        let Completion { oid, parcel, holds, began, ended } = completion;
+    fn give_back(&mut self, completion: FinishedJob) {
+        let FinishedJob { job: SentJob { oid, output, parcel, holds }, began, ended } = completion;
         let state = &mut self.state;
-        if let Some(mut object) = state.objects.take(oid) {
-            state.barrier.take_back(holds);
-            let mut done = Done { parcel: Some(parcel), began, ended };
-            let done = object.returned(&mut Context::new(state, oid), &mut done);
-            let done = done.map_err(|stop| state.blame(stop, object.kind(), oid));
-            state.barrier.end_command();
-            state.objects.put_back(oid, object);
-            if let Err(shutdown) = done {
-                self.shut_down(shutdown);
-            }
+        state.barrier.take_back(holds);
+        let mut done = Done { parcel: Some(parcel), began, ended };
+        let done = match output {
+            Some(place) => state.output_returned(place, &mut done),
+            None => match state.objects.take(oid) {
+                Some(mut object) => {
+                    let done = object.returned(&mut Context::new(state, oid), &mut done);
+                    let done = done.map_err(|stop| state.blame(stop, object.kind(), oid));
+                    state.objects.put_back(oid, object);
+                    done
+                }
+                None => Ok(()),
+            },
+        };
+        state.barrier.end_command();
+        if let Err(shutdown) = done {
+            self.shut_down(shutdown);
         }
         self.state.release(Hold(holds));
     }

@@ -22,11 +22,13 @@ mod context;
 mod dialect;
 mod errand;
 mod generation;
+mod inputs;
 mod lines;
 mod messages;
 mod moves;
 mod objects;
 mod outbox;
+mod outputs;
 mod parameters;
 mod phase;
 mod remote;
@@ -46,12 +48,14 @@ pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use context::Context;
 pub use dialect::{Dialect, Firmware};
-pub use errand::{Completion, Done, Errand, Job, Parcel, Refused, WorkerId, Workers};
+pub use errand::{Done, Errand, FinishedJob, Parcel, Refused, SentJob, WorkerId, Workers};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
-pub use lines::{InputLine, Look, OutputLine, PromptLine};
+pub use inputs::{InputLine, Look};
+pub use lines::EdgeRecorder;
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
 pub use objects::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
+pub use outputs::{OutputLine, PromptLine};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
 pub use scheduler::{Latest, SPIN_MAX};
@@ -62,7 +66,7 @@ pub use timers::Timer;
 pub use wire::{CANBUS_UUID_BYTES, CanHealth, CanNode, CanState, Wire};
 
 use barrier::Barrier;
-use lines::Outputs;
+use lines::Lines;
 use messages::HostWire;
 use objects::{OBJECTS_MAX, Objects};
 use phase::Phase;
@@ -85,13 +89,15 @@ struct State {
     phase: Phase,
     scheduler: Scheduler,
     objects: Objects,
-    outputs: Outputs,
+    lines: Lines,
     barrier: Barrier,
     pending: PendingValues,
     moves: MovePool,
     wire: HostWire,
     board: Box<dyn Board>,
     workers: Box<dyn Workers>,
+    /// Set if somebody records the edges of outputs.
+    recorder: Option<Arc<dyn EdgeRecorder>>,
 }
 
 impl Mcu {
@@ -107,16 +113,22 @@ impl Mcu {
             phase: Phase::default(),
             scheduler: Scheduler::new(timing),
             objects: Objects::default(),
-            outputs: Outputs::default(),
+            lines: Lines::default(),
             barrier: Barrier::default(),
             pending: PendingValues::default(),
             moves: MovePool::default(),
             wire: HostWire::new(dialect, outbox),
             board,
             workers,
+            recorder: None,
         };
         state.wire.send(base::Starting {});
         Mcu { state }
+    }
+
+    /// Records the edges of the outputs that a host claims from now on.
+    pub fn record_edges(&mut self, recorder: Arc<dyn EdgeRecorder>) {
+        self.state.recorder = Some(recorder);
     }
 
     /// The context of a command to the MCU itself. A handler that [`command!`] makes passes it on.

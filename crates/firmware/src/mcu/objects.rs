@@ -225,20 +225,23 @@ impl Context<'_> {
         self.state.objects.own::<T>()
     }
 
-    /// Checks that a new object may be put under `oid`. Call it before claiming the object's pins. An output that is
-    /// claimed for no object would not be driven to its shutdown value.
+    /// Checks that a new object may be put under `oid`, and makes it the object of this context. Call it before
+    /// claiming the object's pins.
     ///
     /// # Errors
     ///
     /// "Can't assign oid" if it already has an object, is out of range, or the configuration is complete.
-    pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
+    pub fn vacant(&mut self, oid: Oid) -> Result<(), Shutdown> {
         let taken =
             |why: &str| Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, format_args!("oid {} is {why}", oid.index())));
         match self.state.objects.get(oid) {
             _ if self.is_finalized() => taken("assigned after finalize_config"),
             _ if oid.index() >= self.state.phase.oids() => taken("not below the count of allocate_oids"),
             Some(_) => taken("assigned twice"),
-            None => Ok(()),
+            None => {
+                self.set_oid(oid);
+                Ok(())
+            }
         }
     }
 

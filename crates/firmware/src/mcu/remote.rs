@@ -50,6 +50,11 @@ impl<S: Settable> Remote<S> {
         Remote { worker, write: Slot::new(Write { output, value }), next: None }
     }
 
+    /// The same for the output at this place.
+    pub(super) fn of_output(place: usize, worker: WorkerId, output: S, value: S::Value) -> Remote<S> {
+        Remote { worker, write: Slot::of_output(place, Write { output, value }), next: None }
+    }
+
     /// Lets the worker set the output to `value`, now or after the present write. If a command calls this, the next
     /// commands wait until the value is written.
     ///

@@ -11,11 +11,15 @@ use std::mem;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::errand::{Job, Parcel, Refused};
+use super::errand::{Parcel, Refused, SentJob};
 use super::{Context, Done, Errand, Hold, WorkerId};
 
 /// The place of an errand. The errand is here or with a worker.
-pub struct Slot<E: Errand>(Place<E>);
+pub struct Slot<E: Errand> {
+    place: Place<E>,
+    /// The place of the output that the errand belongs to; `None` if it belongs to an object.
+    output: Option<usize>,
+}
 
 enum Place<E: Errand> {
     Here(Box<Packed<E>>),
@@ -58,12 +62,17 @@ fn address(parcel: &dyn Parcel) -> usize {
 impl<E: Errand> Slot<E> {
     /// Creates a slot with its errand. This allocates, so objects call it at configuration.
     pub fn new(errand: E) -> Slot<E> {
-        Slot(Place::Here(Box::new(Packed { errand, outcome: None })))
+        Slot { place: Place::Here(Box::new(Packed { errand, outcome: None })), output: None }
+    }
+
+    /// The same for an errand of an output.
+    pub(super) fn of_output(place: usize, errand: E) -> Slot<E> {
+        Slot { output: Some(place), ..Slot::new(errand) }
     }
 
     /// The errand, to prepare it; `None` while it is away.
     pub fn here(&mut self) -> Option<&mut E> {
-        match &mut self.0 {
+        match &mut self.place {
             Place::Here(packed) => Some(&mut packed.errand),
             Place::Away { .. } => None,
         }
@@ -71,17 +80,17 @@ impl<E: Errand> Slot<E> {
 
     /// Whether the errand is here.
     pub fn is_here(&self) -> bool {
-        matches!(self.0, Place::Here(_))
+        matches!(self.place, Place::Here(_))
     }
 
     /// Whether the errand is away and the object still wants its result.
     pub fn is_pending(&self) -> bool {
-        matches!(self.0, Place::Away { counts: true, .. })
+        matches!(self.place, Place::Away { counts: true, .. })
     }
 
     /// Drops the result of an errand that is away.
     pub fn drop_pending(&mut self) {
-        if let Place::Away { counts, .. } = &mut self.0 {
+        if let Place::Away { counts, .. } = &mut self.place {
             *counts = false;
         }
     }
@@ -104,13 +113,13 @@ impl<E: Errand> Slot<E> {
 
     /// The same, with a hold that the sender already has.
     pub(super) fn send_with(&mut self, context: &mut Context, worker: WorkerId, hold: Hold) -> Result<(), Shutdown> {
-        let Place::Here(packed) = &self.0 else { return Ok(()) };
+        let Place::Here(packed) = &self.place else { return Ok(()) };
         let away = Place::Away { address: address(&**packed), counts: true };
-        let Place::Here(parcel) = mem::replace(&mut self.0, away) else { return Ok(()) };
-        match context.submit(worker, Job { oid: context.oid(), parcel, holds: hold.0 }) {
+        let Place::Here(parcel) = mem::replace(&mut self.place, away) else { return Ok(()) };
+        match context.submit(worker, SentJob::new(context.oid(), parcel, hold.0).to_output(self.output)) {
             Ok(()) => Ok(()),
             Err(Refused { job, why }) => {
-                self.put_back(job.parcel);
+                self.put_back(job.into_parcel());
                 context.release(hold);
                 Err(why)
             }
@@ -119,10 +128,10 @@ impl<E: Errand> Slot<E> {
 
     /// Takes a finished errand, if it is this slot's.
     pub fn back(&mut self, done: &mut Done) -> Option<Back<'_, E>> {
-        let Place::Away { address: own, counts } = self.0 else { return None };
+        let Place::Away { address: own, counts } = self.place else { return None };
         let parcel = done.parcel.take_if(|parcel| address(&**parcel) == own)?;
         self.put_back(parcel);
-        let Place::Here(packed) = &self.0 else { return None };
+        let Place::Here(packed) = &self.place else { return None };
         let result = packed.outcome.as_ref()?.as_ref().map(|answer| *answer);
         Some(Back { result, counts, began: done.began, ended: done.ended })
     }
@@ -130,7 +139,7 @@ impl<E: Errand> Slot<E> {
     fn put_back(&mut self, parcel: Box<dyn Parcel>) {
         let any: Box<dyn Any> = parcel;
         if let Ok(packed) = any.downcast() {
-            self.0 = Place::Here(packed);
+            self.place = Place::Here(packed);
         }
     }
 }

@@ -7,7 +7,6 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::{self, Write as _};
-use std::sync::atomic::{AtomicU8, Ordering};
 
 use crate::board::{Direction, Pin};
 use crate::lateness::Lateness;
@@ -221,8 +220,8 @@ impl Mcu {
     /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
     /// begins again if lines or objects came or went meanwhile. It does not allocate.
     pub fn tell(&self, to: &mut Snapshot) -> bool {
-        let State { outputs, objects, workers, .. } = &self.state;
-        let shape = (outputs.len(), objects.len());
+        let State { lines, objects, workers, .. } = &self.state;
+        let shape = (lines.len(), objects.len());
         if to.told == 0 || to.shape != shape {
             to.shape = shape;
             to.told = 1;
@@ -233,7 +232,7 @@ impl Mcu {
         let next = (first + ROWS).min(rows);
         for row in first..next {
             match row.checked_sub(shape.0) {
-                None => append(&mut to.lines, outputs.state(row)),
+                None => append(&mut to.lines, lines.state(row)),
                 Some(index) => {
                     if let Some(state) = self.object_state(index) {
                         append(&mut to.objects, state);
@@ -284,39 +283,5 @@ impl Mcu {
             report: object.report(),
             bus: object.counts(),
         })
-    }
-}
-
-/// The level of a line when it was last driven or read. The core or a worker writes this byte.
-#[derive(Debug)]
-pub(super) struct Level(AtomicU8);
-
-const UNKNOWN: u8 = 2;
-
-impl Level {
-    pub(super) fn of(direction: Direction) -> Level {
-        let level = Level(AtomicU8::new(UNKNOWN));
-        level.begin(direction);
-        level
-    }
-
-    /// Called when the line is set up.
-    pub(super) fn begin(&self, direction: Direction) {
-        match direction {
-            Direction::Output { level, .. } => self.set(level),
-            _ => self.0.store(UNKNOWN, Ordering::Relaxed),
-        }
-    }
-
-    #[inline]
-    pub(super) fn set(&self, level: bool) {
-        self.0.store(u8::from(level), Ordering::Relaxed);
-    }
-
-    pub(super) fn get(&self) -> Option<bool> {
-        match self.0.load(Ordering::Relaxed) {
-            UNKNOWN => None,
-            level => Some(level != 0),
-        }
     }
 }

@@ -32,9 +32,18 @@ pub(super) struct PendingValues {
     owed: Vec<Debt>,
 }
 
-/// An object that owes a shutdown value.
+/// Owner of a pending shutdown value.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Subject {
+    /// An object that drives its device itself.
+    Object(Oid),
+    /// The output at this place of the table of lines.
+    Output(usize),
+}
+
+/// A shutdown value that is still owed.
 struct Debt {
-    oid: Oid,
+    subject: Subject,
     /// The log's name for it.
     name: String,
     /// Whether writing failed.
@@ -56,19 +65,34 @@ impl PendingValues {
 
 impl State {
     /// See [`Context::device_failed`].
-    pub(super) fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
+    pub(super) fn device_failed(&mut self, subject: Subject, shutdown: Shutdown) -> Result<(), Shutdown> {
         if !self.phase.is_stopped() {
-            return Err(shutdown);
+            return Err(shutdown.of(&self.name_subject(subject, None)));
         }
-        let known = self.pending.owed.iter_mut().find(|debt| debt.oid == oid);
+        self.note_failure(subject, None, shutdown);
+        Ok(())
+    }
+
+    /// The log's name for a subject. `kind` is the kind of an object that is not in the table, because it is called.
+    fn name_subject(&self, subject: Subject, kind: Option<&str>) -> String {
+        let oid = match subject {
+            Subject::Object(oid) => oid,
+            Subject::Output(place) => self.owner(place),
+        };
+        let kind = kind.or_else(|| self.objects.get(oid).map(|object| object.kind()));
+        self.name_object(kind.unwrap_or("output"), oid)
+    }
+
+    /// Logs a failure of a stopped MCU. The shutdown value is retried later.
+    pub(super) fn note_failure(&mut self, subject: Subject, kind: Option<&str>, shutdown: Shutdown) {
+        let known = self.pending.owed.iter_mut().find(|debt| debt.subject == subject);
         let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
         // It is retried twenty times a second, but logged once.
         if !again {
-            let trouble = self.blame(shutdown, kind, oid);
+            let trouble = shutdown.of(&self.name_subject(subject, kind));
             self.wire.note(Note::Trouble(&trouble));
         }
         self.retry_later();
-        Ok(())
     }
 
     /// See [`Context::warn`].
@@ -77,32 +101,38 @@ impl State {
         self.wire.note(Note::Warning(&trouble));
     }
 
-    /// See [`Context::is_safe`].
-    pub(super) fn is_safe(&mut self, oid: Oid) {
-        let Some(place) = self.pending.owed.iter().position(|debt| debt.oid == oid) else { return };
+    /// An output or the outputs of an object are at their shutdown values.
+    pub(super) fn is_safe(&mut self, subject: Subject) {
+        let Some(place) = self.pending.owed.iter().position(|debt| debt.subject == subject) else { return };
         let debt = self.pending.owed.swap_remove(place);
         if debt.failed {
             self.wire.note(Note::Safe(&debt.name));
         }
     }
 
-    fn make_safe(&mut self, oid: Oid) {
+    fn make_safe(&mut self, subject: Subject) {
+        let oid = match subject {
+            Subject::Object(oid) => oid,
+            Subject::Output(place) => return self.make_output_safe(place),
+        };
         let Some(mut object) = self.objects.take(oid) else { return };
         let safe = object.make_safe(&mut Context::new(self, oid));
-        let (kind, guarded) = (object.kind(), object.is_guarded());
+        let guarded = object.is_guarded();
         self.objects.put_back(oid, object);
-        if !matches!(safe, Ok(Safe::Now)) && !self.pending.owed.iter().any(|debt| debt.oid == oid) {
-            let name = self.name_object(kind, oid);
+        self.note_safety(subject, guarded, safe);
+    }
+
+    /// Notes the result of an attempt to reach a shutdown value.
+    pub(super) fn note_safety(&mut self, subject: Subject, guarded: bool, safe: Result<Safe, Shutdown>) {
+        if !matches!(safe, Ok(Safe::Now)) && !self.pending.owed.iter().any(|debt| debt.subject == subject) {
+            let name = self.name_subject(subject, None);
             let since = self.scheduler.last_read();
-            self.pending.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
+            self.pending.owed.push(Debt { subject, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
-            Ok(Safe::Now) => self.is_safe(oid),
+            Ok(Safe::Now) => self.is_safe(subject),
             Ok(Safe::Later) => {}
-            Err(trouble) => {
-                // The MCU is stopped, so this logs the failure and returns `Ok`.
-                let _ = self.device_failed(oid, kind, trouble);
-            }
+            Err(failure) => self.note_failure(subject, None, failure),
         }
     }
 
@@ -133,9 +163,9 @@ impl State {
             }
         }
         for place in (0..self.pending.owed.len()).rev() {
-            let failed = self.pending.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
-            if let Some(oid) = failed {
-                self.make_safe(oid);
+            let failed = self.pending.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.subject);
+            if let Some(subject) = failed {
+                self.make_safe(subject);
             }
         }
         self.retry_later();
@@ -174,8 +204,11 @@ impl Mcu {
                 state.objects.put_back(oid, object);
             }
         }
+        for place in 0..state.lines.len() {
+            state.make_output_safe(place);
+        }
         for oid in state.objects.oids() {
-            state.make_safe(oid);
+            state.make_safe(Subject::Object(oid));
         }
         state.pending.under_way = false;
         state.retry_later();

@@ -12,7 +12,7 @@ use std::time::Duration;
 use log::error;
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
-use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
+use pinion_firmware::mcu::{FinishedJob, Refused, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -36,8 +36,8 @@ const END_LIMIT: Duration = Duration::from_secs(2);
 struct Worker {
     bus: String,
     /// The jobs, and when they were submitted.
-    jobs: Producer<(Job, Clock)>,
-    done: Consumer<Completion>,
+    jobs: Producer<(SentJob, Clock)>,
+    done: Consumer<FinishedJob>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
     /// Nobody waits for its end.
@@ -125,7 +125,7 @@ impl Workers for Threads {
         }
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), Refused> {
         let Some(worker) = self.workers.get_mut(worker) else {
             let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
             return Err(Refused { job, why });
@@ -139,7 +139,7 @@ impl Workers for Threads {
         Ok(())
     }
 
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<FinishedJob> {
         self.workers.iter_mut().find_map(|worker| worker.done.pop().ok())
     }
 
@@ -180,8 +180,8 @@ impl Drop for Threads {
 
 /// A worker's thread.
 struct Server {
-    jobs: Consumer<(Job, Clock)>,
-    done: Producer<Completion>,
+    jobs: Consumer<(SentJob, Clock)>,
+    done: Producer<FinishedJob>,
     quit: Arc<AtomicBool>,
     core: Thread,
     clock: Arc<dyn TimeSource>,
@@ -209,19 +209,18 @@ impl Server {
         }
     }
 
-    fn serve(&mut self, job: Job, submitted: Clock) {
-        let Job { oid, mut parcel, holds } = job;
+    fn serve(&mut self, mut job: SentJob, submitted: Clock) {
         self.shown.begin();
         let began = self.clock.now();
-        let number = oid.number();
+        let (number, holds) = (job.oid().number(), job.holds());
         self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
-        let ended = self.clock.errand(&mut || parcel.run());
+        let ended = self.clock.errand(&mut || job.run());
         self.shown.end();
         self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
         // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
-        let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
+        let _ = self.done.push(FinishedJob { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
-        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds)) {
+        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds())) {
             self.core.unpark();
         }
         // Samples, which timers ask for, come at their own pace.
@@ -284,7 +283,7 @@ mod tests {
     }
 
     fn submit(threads: &mut Threads, worker: WorkerId, parcel: Box<dyn Parcel>, holds: bool) {
-        let taken = threads.submit(worker, Job { oid: Oid::new(0), parcel, holds });
+        let taken = threads.submit(worker, SentJob::new(Oid::new(0), parcel, holds));
         assert!(taken.is_ok());
     }
 

@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Done, Feature, Next, Object, Oid, OutputLine, Response, Safe, Timer, WireClock, command, response,
+    Command, Context, Feature, Next, Object, Oid, OutputLine, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -62,8 +62,8 @@ impl Object for Bell {
     }
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle(context)?;
         self.struck = !self.struck;
+        self.line.write(context, self.struck)?;
         if self.struck {
             context.send(Rung { oid: context.oid(), clock: at });
             return Ok(Next::At(at + STRIKE));
@@ -72,16 +72,8 @@ impl Object for Bell {
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        self.line.settle(context, KIND, done)
-    }
-
     fn shutdown(&mut self, _context: &mut Context) {
         self.swinging = false;
         self.struck = false;
-    }
-
-    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
-        self.line.make_safe(context, false)
     }
 }
