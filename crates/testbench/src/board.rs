@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A board that records what the MCU does to its pins. A test plays the devices.
 
+use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -10,7 +11,7 @@ use pinion_firmware::board::{
     self, Adc, Bank, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges,
     I2cConfig, Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
-use pinion_firmware::mcu::{FinishedJob, Refused, SentJob, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, FinishedJob, Refused, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
@@ -831,8 +832,7 @@ pub struct FakeWorkers {
 }
 
 struct Shop {
-    /// Each bus, and when it is free again.
-    buses: Vec<(String, Clock)>,
+    buses: Vec<Bus>,
     /// In the order of their end times.
     under_way: VecDeque<UnderWay>,
     /// Errands that hung when the workers were reset.
@@ -845,6 +845,16 @@ struct UnderWay {
     begin: Clock,
     end: Clock,
     work: Work,
+}
+
+/// A bus and its worker.
+struct Bus {
+    name: String,
+    /// When it is free again.
+    free: Clock,
+    /// `None` while a job runs.
+    devices: Option<Devices>,
+    device_count: usize,
 }
 
 enum Work {
@@ -865,11 +875,12 @@ impl Shop {
 
     /// Delays the errands after one that ran for a time of its own on this worker.
     fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
-        self.buses[worker].1 = self.buses[worker].1.max(ended);
+        let free = &mut self.buses[worker].free;
+        *free = (*free).max(ended);
         for other in self.under_way.iter_mut().filter(|other| other.worker == worker) {
             other.begin = other.begin + by;
             other.end = other.end + by;
-            self.buses[worker].1 = self.buses[worker].1.max(other.end);
+            *free = (*free).max(other.end);
         }
         uncounted(|| self.under_way.make_contiguous().sort_by_key(|other| other.end));
     }
@@ -895,11 +906,19 @@ impl FakeWorkers {
 impl Workers for FakeWorkers {
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         let mut shop = self.shop.lock().unwrap();
-        let known = shop.buses.iter().position(|(name, _)| name == bus);
+        let known = shop.buses.iter().position(|known| known.name == bus);
         Ok(WorkerId(known.unwrap_or_else(|| {
-            shop.buses.push((bus.into(), Clock::EPOCH));
+            let devices = Some(Devices::default());
+            shop.buses.push(Bus { name: bus.into(), free: Clock::EPOCH, devices, device_count: 0 });
             shop.buses.len() - 1
         })))
+    }
+
+    fn give(&mut self, WorkerId(worker): WorkerId, device: Box<dyn Any + Send>) -> Result<usize, Shutdown> {
+        let bus = &mut self.shop.lock().unwrap().buses[worker];
+        bus.devices.as_mut().expect("no job runs").add(device);
+        bus.device_count += 1;
+        Ok(bus.device_count - 1)
     }
 
     fn submit(&mut self, WorkerId(worker): WorkerId, mut job: SentJob) -> Result<(), Refused> {
@@ -909,18 +928,18 @@ impl Workers for FakeWorkers {
         let takes = Ticks(self.bench.state().answer_ticks);
         let at_once = self.bench.state().byte_ticks != 0;
         let mut shop = self.shop.lock().unwrap();
-        let free = &mut shop.buses[worker].1;
-        let begin = self.bench.clock.now().max(*free);
+        let bus = &mut shop.buses[worker];
+        let begin = self.bench.clock.now().max(bus.free);
         let mut end = begin + takes;
         let work = if at_once {
             self.bench.state().bus_now = Some(end);
-            job.run();
+            job.run(bus.devices.as_mut().expect("no job runs"));
             end = self.bench.state().bus_now.take().unwrap_or(end);
             Work::Done(FinishedJob { job, began: begin, ended: end })
         } else {
             Work::ToDo(job)
         };
-        *free = end;
+        bus.free = end;
         shop.insert(UnderWay { worker, begin, end, work });
         Ok(())
     }
@@ -938,7 +957,10 @@ impl Workers for FakeWorkers {
             self.bench.state().on_worker = true;
             self.bench.ago.store(ago.0, Ordering::Relaxed);
             // A worker may take memory, for example for the words of what failed.
-            let ended = uncounted(|| self.bench.clock.errand(&mut || job.run())) - ago;
+            let taken = || self.shop.lock().unwrap().buses[worker].devices.take();
+            let mut devices = taken().expect("no other job runs");
+            let ended = uncounted(|| self.bench.clock.errand(&mut || job.run(&mut devices))) - ago;
+            self.shop.lock().unwrap().buses[worker].devices = Some(devices);
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {

@@ -8,8 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Oid, Slot,
-    command, since,
+    Command, Context, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, JobSlot, Oid, command, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
@@ -37,10 +36,10 @@ struct Ads1220 {
 
 impl ReadyChip for Ads1220 {
     const NAME: &'static str = "ADS1220";
-    type Reading = Conversation<Frame<SAMPLE_BYTES>>;
+    type Reading = Frame<SAMPLE_BYTES>;
 
-    fn read(&mut self, context: &mut Context, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
-        reading.converse(context, self.spi)
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.send_to(context, self.spi)
     }
 
     fn stop(failure: &BusError) -> Shutdown {

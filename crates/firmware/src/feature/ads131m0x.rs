@@ -8,8 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Oid, Slot, command,
-    since,
+    Command, Context, Enumeration, Feature, Generation::Kalico, Generation::Master, JobSlot, Oid, command, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
@@ -152,10 +151,10 @@ fn error_sample(code: u8) -> Sample {
 
 impl ReadyChip for Ads131m0x {
     const NAME: &'static str = "ADS131M0x";
-    type Reading = Conversation<Frame<FRAME_MAX>>;
+    type Reading = Frame<FRAME_MAX>;
 
-    fn read(&mut self, context: &mut Context, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
-        reading.converse(context, self.spi)
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.send_to(context, self.spi)
     }
 
     fn stop(failure: &BusError) -> Shutdown {

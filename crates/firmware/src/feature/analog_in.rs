@@ -8,9 +8,9 @@
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Back, BusCounts, Calls, Command, Constant, Context, Done, Errand, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Next, Object, Oid, Present, Report, Response, Slot, Timer, Unread, WireClock, WorkerId, command,
-    response, since, until,
+    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, Feature, Finished, Generation::Kalico,
+    Generation::Master, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Present, Report, Response, Timer, Unread,
+    WireClock, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -50,18 +50,22 @@ const SAMPLE_BYTES: usize = 2;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// One reading of a channel.
-struct Reading {
+/// A channel, on the worker of its chip.
+struct Channel {
     adc: Box<dyn Adc>,
     calls: Calls,
 }
 
-impl Errand for Reading {
-    type Answer = u16;
+/// One reading of a channel.
+struct Read;
+
+impl Job for Read {
+    type Device = Channel;
+    type Out = u16;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<u16, Shutdown> {
-        self.calls.repeat(|| self.adc.read())
+    fn run(&mut self, channel: &mut Channel) -> Result<u16, Shutdown> {
+        channel.calls.repeat(|| channel.adc.read())
     }
 }
 
@@ -103,8 +107,8 @@ struct Query {
 }
 
 struct AnalogIn {
-    worker: WorkerId,
-    reading: Slot<Reading>,
+    channel: DeviceId<Channel>,
+    reading: JobSlot<Read>,
     calls: Calls,
     unread: Unread,
     /// Whether a sample waits until the ADC has finished a reading of an earlier query.
@@ -141,7 +145,7 @@ impl AnalogIn {
             return Ok(());
         }
         self.unread.asked(context.now());
-        self.reading.send(context, self.worker)
+        self.reading.send(context, self.channel)
     }
 
     /// Moves `next_begin` ahead by one `rest_ticks`, or by as many as it takes to reach the future. Sums that were due
@@ -223,12 +227,12 @@ impl Object for AnalogIn {
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted, ended: read_at, .. }) = self.reading.back(finished) else { return Ok(()) };
         if result.is_ok() {
             self.unread.read();
         }
-        if !counts {
+        if !is_wanted {
             return if std::mem::take(&mut self.waiting) { self.sample(context) } else { Ok(()) };
         }
         let sample = match result {
@@ -290,8 +294,8 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |co
     let OnWorker { bus, device: adc } = context.board()?.adc(pin)?;
     let calls = Calls::new(context.clock());
     let input = AnalogIn {
-        worker: context.worker(&bus)?,
-        reading: Slot::new(Reading { adc, calls: calls.clone() }),
+        channel: context.device(&bus, Box::new(Channel { adc, calls: calls.clone() }))?,
+        reading: JobSlot::new(Read),
         calls,
         unread: Unread::default(),
         waiting: false,

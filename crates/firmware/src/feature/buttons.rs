@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Done, Feature, InputLine, Next, Object, Oid, Response, Timer, WireClock, command, response,
+    Command, Context, Feature, Finished, InputLine, Next, Object, Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -60,8 +60,16 @@ impl RetransmitCount {
     }
 }
 
+/// A button's line. A line that replaces another one has a new number. So a read of the earlier one does not count.
+struct Button {
+    number: u8,
+    line: InputLine,
+}
+
 struct Buttons {
-    buttons: Vec<Option<InputLine>>,
+    buttons: Vec<Option<Button>>,
+    /// The number of the next line's reads.
+    next_number: u8,
     rest_ticks: Ticks,
     /// The levels of the current sample.
     sample: u8,
@@ -84,6 +92,7 @@ impl Buttons {
     fn new(count: usize) -> Buttons {
         Buttons {
             buttons: (0..count).map(|_| None).collect(),
+            next_number: 0,
             rest_ticks: Ticks(0),
             sample: 0,
             unread: 0,
@@ -104,7 +113,9 @@ impl Buttons {
             let what = format_args!("button {place} is set of {count}");
             return Err(Shutdown::by_host(PAST_COUNT, what));
         };
-        *slot = Some(context.late_input(pin, bias(pull_up))?);
+        let number = self.next_number;
+        *slot = Some(Button { number, line: context.late_input(number, pin, bias(pull_up))? });
+        self.next_number = number.wrapping_add(1);
         self.counts = false;
         Ok(())
     }
@@ -115,7 +126,7 @@ impl Buttons {
         self.counts = true;
         for (place, button) in self.buttons.iter_mut().enumerate() {
             let Some(button) = button else { continue };
-            if let Some(level) = button.read(context)? {
+            if let Some(level) = button.line.read(context)? {
                 self.sample |= u8::from(level) << place;
             }
         }
@@ -141,7 +152,7 @@ impl Buttons {
 
     /// Whether workers of expanders are still reading the last sample.
     fn is_awaited(&self) -> bool {
-        self.buttons.iter().flatten().any(InputLine::is_looking)
+        self.buttons.iter().flatten().any(|button| button.line.is_looking())
     }
 
     /// Debounces a complete sample, and reports a new state.
@@ -181,7 +192,7 @@ impl Object for Buttons {
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         // Expanders that are still being read for the last sample miss this one.
         let news = if self.is_awaited() {
-            self.buttons.iter().flatten().try_for_each(|button| button.awaited(context))?;
+            self.buttons.iter().flatten().try_for_each(|button| button.line.awaited(context))?;
             false
         } else {
             self.take_sample(context)?;
@@ -196,10 +207,12 @@ impl Object for Buttons {
     }
 
     /// A worker has read a line of an expander.
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        // A line that was replaced in the meantime does not count: the new line has its own look.
-        for (place, button) in self.buttons.iter_mut().enumerate() {
-            let Some(look) = button.as_mut().and_then(|button| button.sampled(context, done)) else { continue };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let mut buttons = self.buttons.iter_mut().enumerate();
+        let read = buttons.find_map(|(place, button)| Some((place, button.as_mut().filter(|b| b.number == number)?)));
+        if let Some((place, button)) = read
+            && let Some(look) = button.line.sampled(context, finished)
+        {
             match look?.level {
                 Some(level) => self.sample |= u8::from(level) << place,
                 None => self.unread |= 1 << place,

@@ -16,8 +16,8 @@ use log::warn;
 
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Back, Command, Context, Done, Errand, Feature, InputLine, Look, Next, Object, Oid, Response, Slot, Timer,
-    WireClock, WorkerId, command, response,
+    Back, Command, Context, DeviceId, Feature, Finished, InputLine, Job, JobSlot, Look, Next, Object, Oid, Response,
+    Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -93,9 +93,8 @@ impl Settling {
     }
 }
 
-/// Reads the edges that the kernel has timestamped, on a worker.
+/// Reads the edges that the kernel has timestamped.
 struct Reading {
-    edges: Box<dyn Edges>,
     clock: Arc<dyn TimeSource>,
     /// The pin's name in the log.
     name: String,
@@ -110,15 +109,16 @@ struct Reading {
     given_up: bool,
 }
 
-impl Errand for Reading {
+impl Job for Reading {
+    type Device = dyn Edges;
     /// The number of edges, and the time of the last one.
-    type Answer = (u32, Option<Clock>);
+    type Out = (u32, Option<Clock>);
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<(u32, Option<Clock>), Shutdown> {
+    fn run(&mut self, edges: &mut Self::Device) -> Result<(u32, Option<Clock>), Shutdown> {
         // Take the time first. The kernel already has all edges up to it.
         let now = self.clock.now();
-        let Reading { edges, clock, settling, settle, interrupts, .. } = self;
+        let Reading { clock, settling, settle, interrupts, .. } = self;
         edges.take(&mut |Edge { at, level, dropped }| {
             if dropped > 0 {
                 settling.lose(dropped, level);
@@ -132,7 +132,7 @@ impl Errand for Reading {
             self.since = now;
             let per_s = u64::from(std::mem::take(&mut self.interrupts)) * u64::from(CLOCK_FREQ) / ticks;
             if per_s > u64::from(EDGES_PER_S_MAX) {
-                self.edges.end()?;
+                edges.end()?;
                 self.given_up = true;
                 warn!("{}", too_many(&self.name, per_s));
             }
@@ -153,11 +153,14 @@ fn polled(name: &str, why: &str) -> String {
     format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
-/// The errand that reads the kernel's edges, and its worker.
+/// The kernel's edges, and the job that reads them.
 struct Counted {
-    worker: WorkerId,
-    reading: Slot<Reading>,
+    edges: DeviceId<dyn Edges>,
+    reading: JobSlot<Reading>,
 }
+
+/// The number of the job that reads the kernel's edges. The pin's own reads have 0.
+const READING: u8 = 1;
 
 struct Counter {
     pin: InputLine,
@@ -224,7 +227,7 @@ impl Object for Counter {
     }
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        if let Some(Counted { worker, reading }) = &mut self.counted
+        if let Some(Counted { edges, reading }) = &mut self.counted
             && !reading.here().is_some_and(|reading| reading.given_up)
         {
             if self.next_sample <= at {
@@ -234,7 +237,7 @@ impl Object for Counter {
             // A worker that is still reading misses this turn.
             if let Some(ready) = reading.here() {
                 ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
-                reading.send(context, *worker)?;
+                reading.send(context, *edges)?;
             }
             return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
@@ -251,14 +254,14 @@ impl Object for Counter {
     }
 
     /// A worker has read the count, or the pin of an expander.
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(counted) = &mut self.counted
-            && let Some(Back { result, ended, .. }) = counted.reading.back(done)
-        {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == READING {
+            let back = self.counted.as_mut().and_then(|counted| counted.reading.back(finished));
+            let Some(Back { result, ended, .. }) = back else { return Ok(()) };
             let edges = result.map_err(Shutdown::clone);
             return self.has_read(context, edges, ended);
         }
-        let Some(look) = self.pin.sampled(context, done) else { return Ok(()) };
+        let Some(look) = self.pin.sampled(context, finished) else { return Ok(()) };
         let Look { level, ended, .. } = look?;
         if std::mem::take(&mut self.counts) {
             // A pin that could not be read keeps its last level.
@@ -278,10 +281,9 @@ const CONFIG_COUNTER: Command =
         let (line, edges) = context.counted_input(pin, bias(pull_up))?;
         let name = context.name(pin);
         let counted = match edges {
-            Ok((worker, edges)) => {
+            Ok(edges) => {
                 let level = line.prompt_level()?.unwrap_or_default();
                 let reading = Reading {
-                    edges,
                     clock: context.clock(),
                     name,
                     settling: Settling::new(level),
@@ -290,7 +292,7 @@ const CONFIG_COUNTER: Command =
                     interrupts: 0,
                     given_up: false,
                 };
-                Some(Counted { worker, reading: Slot::new(reading) })
+                Some(Counted { edges, reading: JobSlot::numbered(READING, reading) })
             }
             Err(why) => {
                 warn!("{}", polled(&name, &why));

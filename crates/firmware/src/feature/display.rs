@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};
-use crate::mcu::{Context, Done, Object, Remote, Safe, Settable};
+use crate::mcu::{Context, Finished, Object, Remote, Safe, Settable};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -70,9 +70,8 @@ pub(super) struct Display<P: Panel> {
 impl<P: Panel> Display<P> {
     /// Makes a display. Its lines are already at their idle levels.
     pub(super) fn new(context: &mut Context, kind: &'static str, pace: Pace, panel: P) -> Result<Display<P>, Shutdown> {
-        let worker = context.worker(WORKER)?;
-        let panel = Remote::new(worker, Paced { panel, pace: pace.clone() }, Update::Idle);
-        Ok(Display { kind, pace, panel })
+        let panel = context.device(WORKER, Box::new(Paced { panel, pace: pace.clone() }))?;
+        Ok(Display { kind, pace, panel: Remote::new(0, panel, Update::Idle) })
     }
 
     /// Writes bytes. The commands behind this one wait until the display has them.
@@ -89,8 +88,8 @@ impl<P: Panel> Object for Display<P> {
         self.kind
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        self.panel.settle(context, self.kind, done)
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        self.panel.settle(context, self.kind, finished)
     }
 
     /// Aborts a write that is under way.

@@ -7,10 +7,10 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{OnWorker, Thermometer};
+use crate::board::Thermometer;
 use crate::mcu::{
-    Back, Command, Context, Done, Errand, Feature, Generation::Kalico, Generations, Next, Object, Oid, Response, Slot,
-    Timer, WireClock, WorkerId, command, response, since,
+    Back, Command, Context, DeviceId, Feature, Finished, Generation::Kalico, Generations, Job, JobSlot, Next, Object,
+    Oid, Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -47,20 +47,21 @@ const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 const TIMER: Timer = Timer::sampling(0);
 
 /// One reading.
-struct Look(Box<dyn Thermometer>);
+struct Look;
 
-impl Errand for Look {
-    type Answer = i32;
+impl Job for Look {
+    type Device = dyn Thermometer;
+    type Out = i32;
     type Failure = Trouble;
 
-    fn run(&mut self) -> Result<i32, Trouble> {
-        self.0.read()
+    fn run(&mut self, thermometer: &mut Self::Device) -> Result<i32, Trouble> {
+        thermometer.read()
     }
 }
 
 struct Ds18b20 {
-    worker: WorkerId,
-    look: Slot<Look>,
+    thermometer: DeviceId<dyn Thermometer>,
+    look: JobSlot<Look>,
     /// When the reading under way was requested.
     asked: Clock,
     /// When the next reading is due.
@@ -104,7 +105,7 @@ impl Object for Ds18b20 {
         if self.look.is_here() {
             self.asked = at;
             self.next_clock = next;
-            self.look.send(context, self.worker)?;
+            self.look.send(context, self.thermometer)?;
         } else if at.since(self.asked) > READ_LIMIT {
             context.try_shut_down(Shutdown::because(
                 TOO_SLOW,
@@ -115,8 +116,8 @@ impl Object for Ds18b20 {
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
         match result {
             Ok(value) => {
                 self.value = value;
@@ -159,10 +160,10 @@ fn configure(
         let remedy = "serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab";
         return Err(Shutdown::because(INVALID_SERIAL, format!("{serial:?} is no sensor")).remedy(remedy));
     }
-    let OnWorker { bus, device } = context.board()?.ds18b20(serial)?;
+    let thermometer = context.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {
-        worker: context.reader(&bus)?,
-        look: Slot::new(Look(device)),
+        thermometer: context.reader(thermometer)?,
+        look: JobSlot::new(Look),
         asked: Clock::EPOCH,
         next_clock: Clock::EPOCH,
         rest_ticks: Ticks(0),

@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Done, Feature, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, UNREAD_LIMIT,
+    Command, Context, Feature, Finished, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, UNREAD_LIMIT,
     WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
@@ -127,9 +127,9 @@ impl Object for Endstop {
     }
 
     /// The chip's worker has read the line.
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
         let is_homing = self.due.is_some();
-        let look = if is_homing { self.pin.seen(context, done) } else { self.pin.sampled(context, done) };
+        let look = if is_homing { self.pin.seen(context, finished) } else { self.pin.sampled(context, finished) };
         let Some(look) = look else { return Ok(()) };
         let Look { level, began, ended } = look?;
         match level {

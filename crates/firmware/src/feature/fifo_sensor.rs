@@ -11,7 +11,7 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Back, Context, Conversation, Done, Enumeration, Feature, Generation::V0_13, Next, Object, Oid, Slot, Talk, Timer,
+    Back, Chip, Context, Enumeration, Feature, Finished, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Timer,
     WireClock, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
@@ -34,6 +34,12 @@ shutdowns! {
 }
 
 const TIMER: Timer = Timer::sampling(0);
+
+// The numbers of the jobs.
+const READ: u8 = 0;
+const SWITCH: u8 = 1;
+const OVERFLOW: u8 = 2;
+const FILL: u8 = 3;
 
 /// The kind of bus that a chip is on (`bus_oid_type`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -214,10 +220,12 @@ struct Read<C> {
     reading: Reading,
 }
 
-impl<C: FifoChip> Talk for Read<C> {
-    type Answer = Reading;
+impl<C: FifoChip> Job for Read<C> {
+    type Device = Chip;
+    type Out = Reading;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Reading, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Reading, BusError> {
         self.chip.read(chip, &mut self.reading)?;
         Ok(self.reading)
     }
@@ -226,10 +234,12 @@ impl<C: FifoChip> Talk for Read<C> {
 /// Asks how full the FIFO is.
 struct LookAtFill<C>(C);
 
-impl<C: FifoChip> Talk for LookAtFill<C> {
-    type Answer = Option<Fill>;
+impl<C: FifoChip> Job for LookAtFill<C> {
+    type Device = Chip;
+    type Out = Option<Fill>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Option<Fill>, BusError> {
         self.0.fill(chip)
     }
 }
@@ -238,10 +248,12 @@ impl<C: FifoChip> Talk for LookAtFill<C> {
 /// the time of the question for the fill level alone.
 struct LookForOverflow<C>(C);
 
-impl<C: FifoChip> Talk for LookForOverflow<C> {
-    type Answer = bool;
+impl<C: FifoChip> Job for LookForOverflow<C> {
+    type Device = Chip;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         self.0.overflowed(chip)
     }
 }
@@ -252,11 +264,13 @@ struct Switch<C> {
     on: bool,
 }
 
-impl<C: FifoChip> Talk for Switch<C> {
+impl<C: FifoChip> Job for Switch<C> {
+    type Device = Chip;
     /// Whether the sensor is on now.
-    type Answer = bool;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         if self.on { self.chip.switch_on(chip) } else { self.chip.switch_off(chip) }?;
         Ok(self.on)
     }
@@ -286,12 +300,12 @@ pub(super) struct FifoSensor<C: FifoChip> {
     bulk: SensorBulk,
     rest_ticks: Ticks,
     phase: Phase,
-    switch: Slot<Conversation<Switch<C>>>,
-    read: Slot<Conversation<Read<C>>>,
+    switch: JobSlot<Switch<C>>,
+    read: JobSlot<Read<C>>,
     /// Whether a reading is due as soon as the one under way is over.
     waiting: bool,
-    fill: Slot<Conversation<LookAtFill<C>>>,
-    overflow: Slot<Conversation<LookForOverflow<C>>>,
+    fill: JobSlot<LookAtFill<C>>,
+    overflow: JobSlot<LookForOverflow<C>>,
 }
 
 impl<C: FifoChip> FifoSensor<C> {
@@ -301,12 +315,12 @@ impl<C: FifoChip> FifoSensor<C> {
 
     /// Starts a reading, or makes one follow the reading under way.
     fn read(&mut self, context: &mut Context) -> Result<(), Shutdown> {
-        let Some(Conversation { talk: Read { reading, .. }, .. }) = self.read.here() else {
+        let Some(Read { reading, .. }) = self.read.here() else {
             self.waiting = true;
             return Ok(());
         };
         (reading.len, reading.room, reading.overflows) = (0, self.bulk.room(), 0);
-        self.read.converse(context, self.device)
+        self.read.send_to(context, self.device)
     }
 
     fn has_read(&mut self, context: &mut Context, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
@@ -337,7 +351,7 @@ impl<C: FifoChip> FifoSensor<C> {
     /// Notes how many bytes the chip has. A reading under way knows better and is left alone.
     fn has_pending(&mut self, bytes: u16) {
         if let Some(read) = self.read.here() {
-            read.talk.reading.pending = bytes;
+            read.reading.pending = bytes;
         }
     }
 
@@ -349,8 +363,8 @@ impl<C: FifoChip> FifoSensor<C> {
     fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
         // A switch is under way. `switched` then does what is wanted by that time.
         let Some(switch) = self.switch.here() else { return Ok(()) };
-        switch.talk.on = on;
-        self.switch.converse(context, self.device)
+        switch.on = on;
+        self.switch.send_to(context, self.device)
     }
 
     /// The sensor is now on, or off.
@@ -461,12 +475,12 @@ impl<C: FifoChip> FifoSensor<C> {
             return self.ask_fill(context);
         }
         self.overflow.here().ok_or_else(status_amid_status)?;
-        self.overflow.converse(context, self.device)
+        self.overflow.send_to(context, self.device)
     }
 
     fn ask_fill(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         self.fill.here().ok_or_else(status_amid_status)?;
-        self.fill.converse(context, self.device)
+        self.fill.send_to(context, self.device)
     }
 }
 
@@ -491,37 +505,44 @@ impl<C: FifoChip> Object for FifoSensor<C> {
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let error = if let Some(Back { result, counts, ended, .. }) = self.read.back(done) {
-            let result = result.map_err(BusError::clone);
-            if !counts {
-                self.has_pending(0);
-            }
-            match result {
-                Ok(reading) if counts => return self.has_read(context, reading, ended),
-                Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(context) } else { Ok(()) },
-                Err(error) => error,
-            }
-        } else if let Some(Back { result, began, ended, .. }) = self.switch.back(done) {
-            match result {
-                Ok(on) => return self.switched(context, on, (began, ended)),
-                Err(error) => error.clone(),
-            }
-        } else if let Some(Back { result, .. }) = self.overflow.back(done) {
-            match result {
-                Ok(overflowed) => {
-                    self.bulk.count_overflows(overflowed.into());
-                    return self.ask_fill(context);
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let error = match number {
+            SWITCH => {
+                let Some(Back { result, began, ended, .. }) = self.switch.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(on) => return self.switched(context, on, (began, ended)),
+                    Err(error) => error.clone(),
                 }
-                Err(error) => error.clone(),
             }
-        } else if let Some(Back { result, began, ended, .. }) = self.fill.back(done) {
-            match result {
-                Ok(fill) => return self.has_filled(context, fill, (began, ended)),
-                Err(error) => error.clone(),
+            OVERFLOW => {
+                let Some(Back { result, .. }) = self.overflow.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(overflowed) => {
+                        self.bulk.count_overflows(overflowed.into());
+                        return self.ask_fill(context);
+                    }
+                    Err(error) => error.clone(),
+                }
             }
-        } else {
-            return Ok(());
+            FILL => {
+                let Some(Back { result, began, ended, .. }) = self.fill.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(fill) => return self.has_filled(context, fill, (began, ended)),
+                    Err(error) => error.clone(),
+                }
+            }
+            _ => {
+                let Some(Back { result, is_wanted, ended, .. }) = self.read.back(finished) else { return Ok(()) };
+                let result = result.map_err(BusError::clone);
+                if !is_wanted {
+                    self.has_pending(0);
+                }
+                match result {
+                    Ok(reading) if is_wanted => return self.has_read(context, reading, ended),
+                    Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(context) } else { Ok(()) },
+                    Err(error) => error,
+                }
+            }
         };
         self.failed(context, error)
     }
@@ -543,11 +564,11 @@ pub(super) fn configure<C: FifoChip>(context: &mut Context, oid: Oid, device: Oi
         bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(context, own)),
         rest_ticks: Ticks(0),
         phase: Phase::Idle,
-        switch: Slot::talking(Switch { chip, on: false }),
-        read: Slot::talking(Read { chip, reading: Reading::new() }),
+        switch: JobSlot::numbered(SWITCH, Switch { chip, on: false }),
+        read: JobSlot::numbered(READ, Read { chip, reading: Reading::new() }),
         waiting: false,
-        fill: Slot::talking(LookAtFill(chip)),
-        overflow: Slot::talking(LookForOverflow(chip)),
+        fill: JobSlot::numbered(FILL, LookAtFill(chip)),
+        overflow: JobSlot::numbered(OVERFLOW, LookForOverflow(chip)),
     };
     context.assign(oid, sensor)
 }

@@ -11,19 +11,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex};
-
-use crate::board::{Bias, Direction, Line, Mosi, OnWorker, Pin};
+use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Oid,
-    Remote, Settable, Slot, WorkerId, command, since,
+    Back, Command, Context, DeviceId, Feature, Finished, Generation::Kalico, Generation::Master, Generation::V0_13,
+    Job, JobSlot, Oid, Remote, Settable, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
 
 use super::ready_adc::{Ready, ReadyAdc, ReadyChip, Sample};
-use lines::{Shift, Watcher};
-use spi::{Shared, Waves};
+use lines::{Shift, WatchReading, Watcher};
+use spi::Waves;
 
 mod lines;
 mod spi;
@@ -73,65 +71,74 @@ struct Shifted {
     too_long: bool,
 }
 
-/// Reads a sample on a worker.
-enum Reading {
+/// The way to the chip, on a worker.
+enum Way {
     Lines(Shift),
     Spi(Waves),
 }
 
-impl Errand for Reading {
+/// Reads a sample.
+struct Read;
+
+impl Job for Read {
+    type Device = Way;
     /// `None`: no sample is ready.
-    type Answer = Option<Shifted>;
+    type Out = Option<Shifted>;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<Option<Shifted>, Shutdown> {
-        match self {
-            Reading::Lines(shift) => shift.run().map(Some),
-            Reading::Spi(waves) => waves.run(),
+    fn run(&mut self, way: &mut Way) -> Result<Option<Shifted>, Shutdown> {
+        match way {
+            Way::Lines(shift) => shift.run().map(Some),
+            Way::Spi(waves) => waves.run(),
         }
     }
 }
 
 /// The clock line while no sample is shifted out. High switches the chip off.
-enum PowerDown {
-    Line(Arc<dyn Line>),
-    Spi(Shared),
-}
-
-impl Settable for PowerDown {
+impl Settable for Way {
     type Value = bool;
 
     fn set(&mut self, down: bool) -> Result<(), Shutdown> {
         match self {
-            PowerDown::Line(line) => line.write(down),
-            PowerDown::Spi(device) => spi::power_down(device, down),
+            Way::Lines(shift) => shift.power_down(down),
+            Way::Spi(waves) => waves.power_down(down),
         }
     }
 }
 
+// The numbers of the jobs; the reading has 0.
+const POWER_DOWN: u8 = 1;
+const WATCH: u8 = 2;
+
 struct Hx71x {
-    worker: WorkerId,
+    way: DeviceId<Way>,
     gain_channel: u8,
-    power_down: Remote<PowerDown>,
-    /// Watches the pulses of a reading, with its worker.
-    watcher: Option<(WorkerId, Slot<Watcher>)>,
+    power_down: Remote<Way>,
+    /// Watches the pulses of a reading, on its own worker.
+    watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>,
     /// Sent instead of samples until new measurements begin.
     last_error: Option<i32>,
 }
 
+impl Hx71x {
+    fn new(way: DeviceId<Way>, gain_channel: u8, watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>) -> Hx71x {
+        Hx71x { way, gain_channel, power_down: Remote::new(POWER_DOWN, way, true), watch, last_error: None }
+    }
+}
+
 impl ReadyChip for Hx71x {
     const NAME: &'static str = "HX71x";
-    type Reading = Reading;
+    type Reading = Read;
 
-    fn read(&mut self, context: &mut Context, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
-        if let Some((worker, watcher)) = &mut self.watcher {
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Read>) -> Result<(), Shutdown> {
+        if let Some((watcher, watch)) = &mut self.watch {
             // After a reading without its last pulses it may still watch one of them.
-            if !watcher.is_here() {
+            if !watch.is_here() {
                 return Ok(());
             }
-            watcher.send(context, *worker)?;
+            watch.send(context, *watcher)?;
         }
-        reading.send(context, self.worker)
+        reading.send(context, self.way)
     }
 
     fn stop(failure: &Shutdown) -> Shutdown {
@@ -154,13 +161,16 @@ impl ReadyChip for Hx71x {
         self.power_down.set(context, !on)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(Back { result, .. }) = self.watcher.as_mut().and_then(|(_, watcher)| watcher.back(done)) {
-            return result.or_else(|failure| context.try_shut_down(failure.clone()));
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == POWER_DOWN {
+            return match self.power_down.back(context, finished) {
+                Some(Err(failure)) => context.try_shut_down(failure),
+                _ => Ok(()),
+            };
         }
-        match self.power_down.back(context, done) {
-            Some(Err(failure)) => context.try_shut_down(failure),
-            _ => Ok(()),
+        match self.watch.as_mut().and_then(|(_, watch)| watch.back(finished)) {
+            Some(Back { result, .. }) => result.or_else(|failure| context.try_shut_down(failure.clone())),
+            None => Ok(()),
         }
     }
 }
@@ -185,28 +195,24 @@ fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, s
             let cause = format!("{sclk} is no data output of an SPI device");
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
         };
-        let worker = context.worker(&bus)?;
-        let device: Shared = Arc::new(Mutex::new(device));
-        let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);
-        let chip = Hx71x { worker, gain_channel, power_down, watcher: None, last_error: None };
-        let waves = Slot::new(Reading::Spi(Waves::new(device, pulses, sclk)));
-        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
+        let way = context.device(&bus, Box::new(Way::Spi(Waves::new(device, pulses, sclk))))?;
+        let chip = Hx71x::new(way, gain_channel, None);
+        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, Read));
     }
     let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
     let sclk = context.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
-    let worker = context.worker(WORKER)?;
     // A call of the kernel takes about as long as a watcher waits.
     let is_watched = sclk.is_fast() && context.has_parallel_workers();
     let watcher = is_watched.then(|| Watcher::new(context, sclk.clone()));
-    let shift = Shift::new(context, sclk_pin, sclk.clone(), dout.clone(), pulses, watcher.as_ref());
-    let watcher = match watcher {
-        Some(watcher) => Some((context.worker(WATCHER)?, Slot::new(watcher))),
+    let shift = Shift::new(context, sclk_pin, sclk, dout.clone(), pulses, watcher.as_ref());
+    let way = context.device(WORKER, Box::new(Way::Lines(shift)))?;
+    let watch = match watcher {
+        Some(watcher) => Some((context.device(WATCHER, Box::new(watcher))?, JobSlot::numbered(WATCH, WatchReading))),
         None => None,
     };
-    let power_down = Remote::new(worker, PowerDown::Line(sclk), true);
-    let chip = Hx71x { worker, gain_channel, power_down, watcher, last_error: None };
-    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
+    let chip = Hx71x::new(way, gain_channel, watch);
+    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Read))
 }
 
 type Sensor = ReadyAdc<Hx71x>;

@@ -9,10 +9,10 @@
 #![forbid(unsafe_code)]
 
 use crate::board::soft_i2c::SoftI2c;
-use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, Pin, Range};
+use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{
-    Back, Bus, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_11, Generation::V0_12, Generation::V0_13, Object, Oid, Response, Slot, Talk, command, only,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_11, Generation::V0_12, Generation::V0_13, Job, JobSlot, Object, Oid, Response, command, only,
     response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
@@ -146,10 +146,12 @@ impl Transfer {
     }
 }
 
-impl Talk for Transfer {
-    type Answer = ();
+impl Job for Transfer {
+    type Device = Chip;
+    type Out = ();
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         let read = &mut self.read[..self.read_len];
         match &self.write[..self.write_len] {
             [] if !read.is_empty() => chip.read_register(&[], read),
@@ -172,7 +174,7 @@ pub(super) struct I2c {
     bus: Option<Bus>,
     /// Whether the bus is a software bus on lines.
     on_lines: bool,
-    transfer: Slot<Conversation<Transfer>>,
+    transfer: JobSlot<Transfer>,
     /// Whether the last transfer failed. Only the first failure is logged: an unplugged display fails many times a
     /// second.
     failing: bool,
@@ -180,7 +182,7 @@ pub(super) struct I2c {
 
 impl I2c {
     fn new() -> I2c {
-        let transfer = Slot::talking(Transfer::new(Purpose::Transfer, &[], 0));
+        let transfer = JobSlot::new(Transfer::new(Purpose::Transfer, &[], 0));
         I2c { bus: None, on_lines: false, transfer, failing: false }
     }
 
@@ -214,12 +216,12 @@ impl I2c {
             let error = BusError::new(status, "it has no bus: a fault of the host, which did not send i2c_set_bus");
             return Err(self.failure(context, matches!(transfer.purpose, Purpose::Write), error));
         };
-        // Commands wait for each other, so the conversation is here.
-        let Some(conversation) = self.transfer.here() else {
+        // Commands wait for each other, so the job is here.
+        let Some(present) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
-        conversation.talk = transfer;
-        self.transfer.converse_on(context, bus)
+        *present = transfer;
+        self.transfer.send(context, bus.chip())
     }
 
     /// The shutdown for a failed transfer, depending on whether it was writing or reading.
@@ -239,10 +241,10 @@ impl Object for I2c {
     }
 
     /// Reports the result of a transfer to the host. If the answer has no status, a failure stops the MCU.
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.transfer.back(finished) else { return Ok(()) };
         let result = result.map_err(BusError::clone);
-        let Some(Conversation { talk: transfer, .. }) = self.transfer.here() else { return Ok(()) };
+        let Some(transfer) = self.transfer.here() else { return Ok(()) };
         let response = transfer.response();
         match (transfer.purpose, &result) {
             (Purpose::Transfer, result) => {

@@ -12,9 +12,9 @@ use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
 use crate::mcu::{
-    Back, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Generations, Next, Object, Oid, Response, Slot, Talk, Timer, WireClock, command, only, response,
-    since,
+    Back, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Generations, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only,
+    response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -105,11 +105,13 @@ struct Look {
     error: u8,
 }
 
-impl Talk for Look {
+impl Job for Look {
+    type Device = Chip;
     /// Both words of channel 0.
-    type Answer = Option<u32>;
+    type Out = Option<u32>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<u32>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Option<u32>, BusError> {
         self.error = I2C_STATUS_ERROR;
         if !is_ready(chip)? {
             return Ok(None);
@@ -124,10 +126,12 @@ impl Talk for Look {
 /// Asks whether there is a sample.
 struct Ask;
 
-impl Talk for Ask {
-    type Answer = bool;
+impl Job for Ask {
+    type Device = Chip;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         is_ready(chip)
     }
 }
@@ -172,14 +176,18 @@ impl Homing {
 
 const KIND: &str = "LDC1612";
 
+// The numbers of the jobs.
+const LOOK: u8 = 0;
+const ASK: u8 = 1;
+
 struct Ldc1612 {
     i2c: Oid,
     /// Low while a sample is ready.
     intb: Option<Arc<dyn Line>>,
-    look: Slot<Conversation<Look>>,
+    look: JobSlot<Look>,
     /// Turns of the timer that came during a reading.
     missed: u16,
-    ask: Slot<Conversation<Ask>>,
+    ask: JobSlot<Ask>,
     rest_ticks: Ticks,
     bulk: SensorBulk,
     attached: Attached,
@@ -196,9 +204,9 @@ impl Ldc1612 {
         let sensor = Ldc1612 {
             i2c,
             intb,
-            look: Slot::talking(Look { error: I2C_STATUS_ERROR }),
+            look: JobSlot::numbered(LOOK, Look { error: I2C_STATUS_ERROR }),
             missed: 0,
-            ask: Slot::talking(Ask),
+            ask: JobSlot::numbered(ASK, Ask),
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
             attached: Attached::default(),
@@ -229,7 +237,7 @@ impl Ldc1612 {
         if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
             return Ok(());
         }
-        self.look.converse(context, self.i2c)
+        self.look.send_to(context, self.i2c)
     }
 
     /// Makes up for the turns that came while the sensor was read. The firmware's timer waits for the bus. So the first
@@ -272,7 +280,7 @@ impl Ldc1612 {
 
     fn query_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let Some(intb) = &self.intb else {
-            return self.ask.converse(context, self.i2c);
+            return self.ask.send_to(context, self.i2c);
         };
         let now = context.now();
         // A sample that is being read counts as one in the chip.
@@ -296,21 +304,22 @@ impl Object for Ldc1612 {
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(Back { result, counts, ended, .. }) = self.look.back(done) {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == LOOK {
+            let Some(Back { result, is_wanted, ended, .. }) = self.look.back(finished) else { return Ok(()) };
             let read = result.ok();
             Self::note(&mut self.failing, context, result.err())?;
             let words = match read {
                 Some(words) => words.map(Ok),
-                None => self.look.here().map(|look| Err(look.talk.error)),
+                None => self.look.here().map(|look| Err(look.error)),
             };
-            if let (true, Some(words)) = (counts, words) {
+            if let (true, Some(words)) = (is_wanted, words) {
                 self.add(context, words, ended)?;
             }
             return self.make_up(context);
         }
         // If there is no answer, klippy asks again.
-        let Some(Back { result, began, ended, .. }) = self.ask.back(done) else { return Ok(()) };
+        let Some(Back { result, began, ended, .. }) = self.ask.back(finished) else { return Ok(()) };
         if let Ok(ready) = result {
             self.bulk.send_status(context, (began, ended), if ready { SAMPLE_BYTES } else { 0 });
         }

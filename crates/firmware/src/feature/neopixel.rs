@@ -9,7 +9,7 @@
 
 use crate::board::{Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, Done, Errand, Feature, Object, Oid, Response, Slot, WorkerId, command, response,
+    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Object, Oid, Response, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -53,28 +53,26 @@ enum Way {
 }
 
 /// Sends the chain's colors.
-struct Frame {
-    data: Vec<u8>,
-    way: Way,
-}
+struct Frame(Vec<u8>);
 
-impl Errand for Frame {
+impl Job for Frame {
+    type Device = Way;
     /// Whether the pulses had their times.
-    type Answer = bool;
+    type Out = bool;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<bool, Shutdown> {
-        match &mut self.way {
-            Way::Spi(waves) => waves.send(&self.data).map(|()| true),
-            Way::Line(pulses) => pulses.send(&self.data),
+    fn run(&mut self, way: &mut Way) -> Result<bool, Shutdown> {
+        match way {
+            Way::Spi(waves) => waves.send(&self.0).map(|()| true),
+            Way::Line(pulses) => pulses.send(&self.0),
         }
     }
 }
 
 struct Neopixel {
-    worker: WorkerId,
+    way: DeviceId<Way>,
     data: Vec<u8>,
-    frame: Slot<Frame>,
+    frame: JobSlot<Frame>,
     /// Whether the log already has a line about failed sending.
     failing: bool,
 }
@@ -97,8 +95,8 @@ impl Neopixel {
         let Some(frame) = self.frame.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
         };
-        frame.data.copy_from_slice(&self.data);
-        self.frame.send(context, self.worker)
+        frame.0.copy_from_slice(&self.data);
+        self.frame.send(context, self.way)
     }
 }
 
@@ -107,8 +105,8 @@ impl Object for Neopixel {
         "neopixel"
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.frame.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.frame.back(finished) else { return Ok(()) };
         context.send(Sent { oid: context.oid(), success: result == Ok(true) });
         // No color is worth a print. klippy tries eight times for each change, so only the first failure is logged.
         let known = std::mem::replace(&mut self.failing, result.is_err());
@@ -120,24 +118,19 @@ impl Object for Neopixel {
     }
 }
 
-/// The way to the LEDs at a pin, and its worker.
-fn way(
-    context: &mut Context,
-    pin: Pin,
-    size: usize,
-    bit_max: Ticks,
-    reset: Ticks,
-) -> Result<(WorkerId, Way), Shutdown> {
+/// The way to the LEDs at a pin.
+fn way(context: &mut Context, pin: Pin, size: usize, bit_max: Ticks, reset: Ticks) -> Result<DeviceId<Way>, Shutdown> {
     let Some(mosi) = context.board()?.mosi(pin, spi::RATE_HZ)? else {
         let line = context.prompt_line(pin, "LED", Direction::Output { level: false, shutdown_value: false })?;
-        return Ok((context.worker(line::WORKER)?, Way::Line(Pulses::new(context, pin, line, size, bit_max, reset)?)));
+        let pulses = Pulses::new(context, pin, line, size, bit_max, reset)?;
+        return context.device(line::WORKER, Box::new(Way::Line(pulses)));
     };
     let Mosi { line: OnWorker { bus, device }, message_max, pauses } = mosi;
     let waves = Waves::new(device, size, reset, message_max).map_err(|error| error.of(&context.name(pin)))?;
     if let Some(trouble) = pauses {
         log::warn!("{trouble}");
     }
-    Ok((context.worker(&bus)?, Way::Spi(waves)))
+    context.device(&bus, Box::new(Way::Spi(waves)))
 }
 
 const CONFIG_NEOPIXEL: Command = command!(
@@ -148,9 +141,9 @@ const CONFIG_NEOPIXEL: Command = command!(
             return Err(Shutdown::by_host(INVALID_SIZE, format_args!("a chain of {data_size} bytes")));
         }
         let size = usize::from(data_size);
-        let (worker, way) = way(context, pin, size, bit_max_ticks, reset_min_ticks.max(RESET_MIN))?;
-        let frame = Slot::new(Frame { data: vec![0; size], way });
-        context.assign_on(pin, oid, Neopixel { worker, data: vec![0; size], frame, failing: false })
+        let way = way(context, pin, size, bit_max_ticks, reset_min_ticks.max(RESET_MIN))?;
+        let frame = JobSlot::new(Frame(vec![0; size]));
+        context.assign_on(pin, oid, Neopixel { way, data: vec![0; size], frame, failing: false })
     }
 );
 

@@ -6,7 +6,7 @@
 
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Context, Done, Feature, Next, Object, Oid, Present, Remote, Report, Safe,
+    BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Present, Remote, Report, Safe,
     Settable, Timer, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
@@ -56,11 +56,11 @@ impl Settable for Channel {
 }
 
 /// Opens a channel. As in the firmware, several objects may have the same channel, each with its own files.
-fn open(context: &mut Context, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
+fn open(context: &mut Context, number: u8, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
     let OnWorker { bus, device: pwm } = context.board()?.pwm(config)?;
-    let (worker, calls) = (context.worker(&bus)?, Calls::new(context.clock()));
-    let channel = Channel { pwm, calls: calls.clone() };
-    Ok((Remote::new(worker, channel, Setting { value: config.value, cycle: None }), calls))
+    let calls = Calls::new(context.clock());
+    let channel = context.device(&bus, Box::new(Channel { pwm, calls: calls.clone() }))?;
+    Ok((Remote::new(number, channel, Setting { value: config.value, cycle: None }), calls))
 }
 
 const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM };
@@ -91,8 +91,8 @@ impl Object for PwmOut {
         self.queue.next(value, at)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        self.channel.settle(context, KIND, done)
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        self.channel.settle(context, KIND, finished)
     }
 
     fn report(&self) -> Report {
@@ -131,14 +131,15 @@ impl SetChannels {
             }
             _ if context.is_finalized() => Err(set_too_late(context, reason::PWM_CONFIG, "set_pwm_out", pin)),
             Some(place) => {
-                self.0[place].1 = open(context, config)?.0;
+                self.0[place].1 = open(context, place as u8, config)?.0;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
             }
             None => {
-                self.0.push((pin, open(context, config)?.0));
+                let number = self.0.len() as u8;
+                self.0.push((pin, open(context, number, config)?.0));
                 Ok(())
             }
         }
@@ -150,9 +151,9 @@ impl Object for SetChannels {
         "set_pwm_out"
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let mut channels = self.0.iter_mut();
-        channels.try_for_each(|(_, channel)| channel.settle(context, "set_pwm_out", done))
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let channel = self.0.get_mut(usize::from(number));
+        channel.map_or(Ok(()), |(_, channel)| channel.settle(context, "set_pwm_out", finished))
     }
 }
 
@@ -161,7 +162,7 @@ const CONFIG_PWM_OUT: Command = command!(
     |context, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         context.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
-        let (channel, calls) = open(context, config)?;
+        let (channel, calls) = open(context, 0, config)?;
         let queue = ValueQueue::new(default_value, max_duration, &TEXTS);
         context.assign_on(pin, oid, PwmOut { channel, calls, value, queue })
     }

@@ -13,8 +13,8 @@
 
 use std::sync::Arc;
 
-use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
-use crate::mcu::{Back, Context, Conversation, Done, Errand, Next, Object, Oid, Slot, Talk, Timer};
+use crate::board::{Bias, BusError, Direction, Line, Pin};
+use crate::mcu::{Back, Chip, Context, Finished, Job, JobSlot, Next, Object, Oid, Timer};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
@@ -23,6 +23,8 @@ use super::spi::Spi;
 use super::trigger_analog::Attached;
 
 const TIMER: Timer = Timer::sampling(0);
+/// The number of the job that reads a sample.
+const READING: u8 = 0;
 
 /// The result of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,16 +59,16 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
     /// The chip's name in the log.
     const NAME: &'static str;
     /// Reads a sample on a worker.
-    type Reading: Errand;
+    type Reading: Job;
 
     /// Starts to read a sample.
-    fn read(&mut self, context: &mut Context, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown>;
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown>;
 
     /// The shutdown for a chip that could not be read.
-    fn stop(failure: &<Self::Reading as Errand>::Failure) -> Shutdown;
+    fn stop(failure: &<Self::Reading as Job>::Failure) -> Shutdown;
 
     /// Converts the answer of a reading that counts. `late` says that the reading was not back in time.
-    fn sample(&mut self, answer: <Self::Reading as Errand>::Answer, late: bool) -> Sample;
+    fn sample(&mut self, answer: <Self::Reading as Job>::Out, late: bool) -> Sample;
 
     /// How many values make a sample.
     fn channels(&self) -> usize {
@@ -79,9 +81,9 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
         Ok(())
     }
 
-    /// Another errand than a reading has returned.
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let _ = (context, done);
+    /// A job of the chip's own has finished. Its number is not [`READING`].
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let _ = (context, number, finished);
         Ok(())
     }
 }
@@ -108,7 +110,7 @@ const READING_RESTS: u32 = 8;
 pub(super) struct ReadyAdc<C: ReadyChip> {
     chip: C,
     ready: Ready,
-    reading: Slot<C::Reading>,
+    reading: JobSlot<C::Reading>,
     /// Whether the reading under way is late.
     late: bool,
     rest_ticks: Ticks,
@@ -119,11 +121,11 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
 
 impl<C: ReadyChip> ReadyAdc<C> {
     /// A sensor.
-    pub(super) fn new(chip: C, ready: Ready, reading: Slot<C::Reading>) -> ReadyAdc<C> {
+    pub(super) fn new(chip: C, ready: Ready, reading: C::Reading) -> ReadyAdc<C> {
         ReadyAdc {
             chip,
             ready,
-            reading,
+            reading: JobSlot::numbered(READING, reading),
             late: false,
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
@@ -211,12 +213,13 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         Ok(Next::At(at + Ticks(self.rest_ticks.0.wrapping_mul(rests))))
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else {
-            return self.chip.returned(context, done);
-        };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number != READING {
+            return self.chip.finished(context, number, finished);
+        }
+        let Some(Back { result, is_wanted, ended: read_at, .. }) = self.reading.back(finished) else { return Ok(()) };
         let answer = match result {
-            Ok(answer) if counts => answer,
+            Ok(answer) if is_wanted => answer,
             Ok(_) => return Ok(()),
             Err(failure) => return context.try_shut_down(C::stop(failure)),
         };
@@ -273,10 +276,12 @@ impl<const N: usize> Frame<N> {
     }
 }
 
-impl<const N: usize> Talk for Frame<N> {
-    type Answer = Frame<N>;
+impl<const N: usize> Job for Frame<N> {
+    type Device = Chip;
+    type Out = Frame<N>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Frame<N>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Frame<N>, BusError> {
         self.bytes = [0; N];
         chip.exchange(&mut self.bytes[..self.len])?;
         Ok(*self)
@@ -284,7 +289,7 @@ impl<const N: usize> Talk for Frame<N> {
 }
 
 /// Makes a sensor with this `oid`. It is read over SPI in frames of `len` bytes.
-pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<Frame<N>>>>(
+pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Frame<N>>>(
     context: &mut Context,
     oid: Oid,
     (spi, ready_pin): (Oid, Pin),
@@ -294,11 +299,7 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
     context.vacant(oid)?;
     context.require::<Spi>(spi)?;
     let ready = context.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
-    context.assign_on(
-        ready_pin,
-        oid,
-        ReadyAdc::new(chip, Ready::Line(ready), Slot::talking(Frame { bytes: [0; N], len: len.min(N) })),
-    )
+    context.assign_on(ready_pin, oid, ReadyAdc::new(chip, Ready::Line(ready), Frame { bytes: [0; N], len: len.min(N) }))
 }
 
 /// Converts 24 bits in two's complement, the highest byte first.

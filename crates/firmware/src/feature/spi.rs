@@ -13,10 +13,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::board::soft_spi::SoftSpi;
-use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
+use crate::board::{BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
-    Back, Bus, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Object, Oid, Response, Safe, Slot, Talk, command, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -65,8 +65,8 @@ impl Transfer {
     const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true };
 
     /// An empty transfer, for a later load.
-    pub(super) fn slot() -> Slot<Conversation<Transfer>> {
-        Slot::talking(Transfer::EMPTY)
+    pub(super) fn slot(number: u8) -> JobSlot<Transfer> {
+        JobSlot::numbered(number, Transfer::EMPTY)
     }
 
     /// Loads bytes to exchange for the bytes that come back.
@@ -87,10 +87,12 @@ impl Transfer {
     }
 }
 
-impl Talk for Transfer {
-    type Answer = ();
+impl Job for Transfer {
+    type Device = Chip;
+    type Out = ();
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         let bytes = &mut self.bytes[..self.len];
         if self.reads { chip.exchange(bytes) } else { chip.send(bytes) }
     }
@@ -122,15 +124,17 @@ struct Message {
     number: u32,
 }
 
-impl Talk for Message {
-    type Answer = ();
+impl Job for Message {
+    type Device = Chip;
+    type Out = ();
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         // A transfer that reads is not skipped, because the host waits for its answer.
         if self.number != self.round.number() && !self.transfer.reads {
             return Ok(());
         }
-        self.transfer.talk(chip).inspect_err(|_| self.round.end())
+        self.transfer.run(chip).inspect_err(|_| self.round.end())
     }
 }
 
@@ -138,15 +142,15 @@ impl Talk for Message {
 pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
-    messages: [Slot<Conversation<Message>>; UNDER_WAY_MAX],
+    messages: [JobSlot<Message>; UNDER_WAY_MAX],
     round: Round,
 }
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
         let round = Round::default();
-        let messages = std::array::from_fn(|_| {
-            Slot::talking(Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
+        let messages = std::array::from_fn(|number| {
+            JobSlot::numbered(number as u8, Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
         });
         Spi { bus: None, chip_select, messages, round }
     }
@@ -209,11 +213,11 @@ impl Spi {
         let Some(slot) = self.messages.iter_mut().find(|slot| slot.is_here()) else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
-        if let Some(Conversation { talk: message, .. }) = slot.here() {
+        if let Some(message) = slot.here() {
             message.number = self.round.number();
             if answers { message.transfer.load(data) } else { message.transfer.load_to_send(data) }
         }
-        slot.converse_on(context, bus)?;
+        slot.send(context, bus.chip())?;
         if !answers {
             context.let_join(UNDER_WAY_MAX as u32);
         }
@@ -237,18 +241,14 @@ impl Object for Spi {
         "SPI device"
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
         let kind = self.kind();
-        for slot in &mut self.messages {
-            let Some(Back { result, .. }) = slot.back(done) else { continue };
-            if let Err(error) = result {
-                let failure = spi_shutdown(error.clone());
-                return context.device_failed(kind, failure);
-            }
-            if let Some(Conversation { talk: message, .. }) = slot.here().filter(|here| here.talk.transfer.reads) {
-                context.send(TransferResponse { oid: context.oid(), response: message.transfer.bytes() });
-            }
-            return Ok(());
+        let message = &mut self.messages[usize::from(number)];
+        if let Some(Back { result: Err(error), .. }) = message.back(finished) {
+            return context.device_failed(kind, spi_shutdown(error.clone()));
+        }
+        if let Some(Message { transfer, .. }) = message.here().filter(|message| message.transfer.reads) {
+            context.send(TransferResponse { oid: context.oid(), response: transfer.bytes() });
         }
         Ok(())
     }
@@ -265,7 +265,7 @@ impl Object for Spi {
 /// The message for a device at a shutdown.
 struct SpiShutdown {
     spi: Oid,
-    message: Slot<Conversation<Transfer>>,
+    message: JobSlot<Transfer>,
     bytes: Box<[u8]>,
 }
 
@@ -274,8 +274,8 @@ impl Object for SpiShutdown {
         "SPI shutdown message"
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.message.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.message.back(finished) else { return Ok(()) };
         match result {
             Ok(()) => {
                 context.is_safe();
@@ -299,8 +299,8 @@ impl Object for SpiShutdown {
             return Ok(Safe::Now);
         }
         if let Some(message) = self.message.here() {
-            message.talk.load_to_send(&self.bytes);
-            self.message.converse(context, self.spi)?;
+            message.load_to_send(&self.bytes);
+            self.message.send_to(context, self.spi)?;
         }
         Ok(Safe::Later)
     }
@@ -362,6 +362,6 @@ const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
     |context, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
         context.require::<Spi>(spi_oid)?;
-        context.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(), bytes: shutdown_msg.into() })
+        context.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(0), bytes: shutdown_msg.into() })
     }
 );

@@ -8,9 +8,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Back, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::V0_12,
-    Generation::V0_13, Generations, Hold, Next, Object, Oid, Response, Slot, Timer, WireClock, command, response,
-    until,
+    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::V0_12, Generation::V0_13,
+    Generations, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -251,6 +250,10 @@ struct Upcoming {
 
 const KIND: &str = "angle sensor";
 
+// The numbers of the jobs.
+const MEASUREMENT: u8 = 0;
+const TRANSFER: u8 = 1;
+
 struct SpiAngle {
     chip: Chip,
     spi: Oid,
@@ -263,9 +266,9 @@ struct SpiAngle {
     /// The host's transfer waits for the request under way. Commands wait for the transfer.
     asked: Option<Hold>,
     /// For measurements, and prefaces of transfers.
-    measurement: Slot<Conversation<Transfer>>,
+    measurement: JobSlot<Transfer>,
     /// For transfers of the host.
-    transfer: Slot<Conversation<Transfer>>,
+    transfer: JobSlot<Transfer>,
 }
 
 impl SpiAngle {
@@ -289,7 +292,7 @@ impl SpiAngle {
         let begun = match (preface, &asking.purpose) {
             (Some(preface), _) => self.say(context, preface),
             (None, Purpose::Measurement { .. }) => self.say(context, self.chip.message()),
-            (None, Purpose::Transfer { .. }) => self.transfer.converse(context, self.spi),
+            (None, Purpose::Transfer { .. }) => self.transfer.send_to(context, self.spi),
         };
         if begun.is_err() {
             self.over(context);
@@ -300,9 +303,9 @@ impl SpiAngle {
     fn say(&mut self, context: &mut Context, message: &[u8]) -> Result<(), Shutdown> {
         // Nothing else is under way, so the conversation is here.
         if let Some(measurement) = self.measurement.here() {
-            measurement.talk.load(message);
+            measurement.load(message);
         }
-        self.measurement.converse(context, self.spi)
+        self.measurement.send_to(context, self.spi)
     }
 
     /// Processes the end of a conversation. Returns true if the request is finished.
@@ -320,7 +323,7 @@ impl SpiAngle {
                     return Ok(true);
                 }
                 Purpose::Measurement { .. } => self.say(context, self.chip.message())?,
-                Purpose::Transfer { .. } => self.transfer.converse(context, self.spi)?,
+                Purpose::Transfer { .. } => self.transfer.send_to(context, self.spi)?,
             }
             return Ok(false);
         }
@@ -328,13 +331,13 @@ impl SpiAngle {
         let latched = latched.unwrap_or(if self.chip.latches_at_end(purpose) { ended } else { began });
         match (purpose, self.measurement.here(), self.transfer.here()) {
             (Purpose::Transfer { .. }, _, Some(transfer)) => {
-                let response = if too_slow { &[] } else { transfer.talk.bytes() };
+                let response = if too_slow { &[] } else { transfer.bytes() };
                 context.send(TransferResponse { oid: context.oid(), clock: latched, response });
             }
             (Purpose::Measurement { due }, Some(measurement), _) => {
                 let due = *due;
                 let mut reply = [0; MESSAGE_MAX];
-                reply.iter_mut().zip(measurement.talk.bytes()).for_each(|(to, from)| *to = *from);
+                reply.iter_mut().zip(measurement.bytes()).for_each(|(to, from)| *to = *from);
                 let measured = if too_slow { Err(Fault::SpiTime) } else { self.chip.decode(&reply) };
                 self.measured(context, due, measured, latched);
             }
@@ -387,7 +390,7 @@ impl SpiAngle {
         let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
         };
-        transfer.talk.load(data);
+        transfer.load(data);
         // A timer may have begun the request under way. The transfer behind it then does not hold commands by itself.
         self.asked = Some(context.hold());
         self.go_on(context)
@@ -406,9 +409,9 @@ impl Object for SpiAngle {
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let back = self.measurement.back(done).or_else(|| self.transfer.back(done));
-        let Some(Back { result, began, ended, .. }) = back else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let slot = if number == TRANSFER { &mut self.transfer } else { &mut self.measurement };
+        let Some(Back { result, began, ended, .. }) = slot.back(finished) else { return Ok(()) };
         let is_over = match result {
             Ok(()) => self.take_in(context, began, ended),
             Err(error) => context.device_failed(KIND, spi_shutdown(error.clone())).map(|()| true),
@@ -451,8 +454,8 @@ const CONFIG_SPI_ANGLE: Command = command!(
             asking: None,
             upcoming: None,
             asked: None,
-            measurement: Transfer::slot(),
-            transfer: Transfer::slot(),
+            measurement: Transfer::slot(MEASUREMENT),
+            transfer: Transfer::slot(TRANSFER),
         };
         context.assign(oid, sensor)
     }

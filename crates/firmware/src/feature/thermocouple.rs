@@ -7,8 +7,8 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Back, Command, Context, Conversation, Done, Enumeration, Feature, Generation::Kalico, Next, Object, Oid, Response,
-    Slot, Talk, Timer, WireClock, command, response, since,
+    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Job, JobSlot, Next, Object, Oid,
+    Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -123,11 +123,13 @@ fn types(_board: &dyn Board) -> Vec<Range> {
 /// One look at the chip.
 struct Look(Chip);
 
-impl Talk for Look {
+impl Job for Look {
+    type Device = dyn BusDevice;
     /// The word, and the fault bits.
-    type Answer = (u32, u8);
+    type Out = (u32, u8);
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(u32, u8), BusError> {
+    fn run(&mut self, chip: &mut Self::Device) -> Result<(u32, u8), BusError> {
         let template = self.0.word_message();
         let mut buffer = [0; 4];
         let word = &mut buffer[..template.len()];
@@ -145,7 +147,7 @@ impl Talk for Look {
 struct Thermocouple {
     spi: Oid,
     chip: Chip,
-    look: Slot<Conversation<Look>>,
+    look: JobSlot<Look>,
     rest_ticks: Ticks,
     min_value: u32,
     max_value: u32,
@@ -193,13 +195,13 @@ impl Object for Thermocouple {
         // A chip that is still being read misses this turn.
         if self.look.is_here() {
             self.next_clock = next;
-            self.look.converse(context, self.spi)?;
+            self.look.send_to(context, self.spi)?;
         }
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
         match result {
             Ok((value, fault)) => {
                 context.send(Reading { oid: context.oid(), next_clock: self.next_clock, value, fault });
@@ -225,7 +227,7 @@ const CONFIG_THERMOCOUPLE: Command = command!(
         let object = Thermocouple {
             spi: spi_oid,
             chip,
-            look: Slot::talking(Look(chip)),
+            look: JobSlot::new(Look(chip)),
             rest_ticks: Ticks(0),
             min_value: 0,
             max_value: 0,

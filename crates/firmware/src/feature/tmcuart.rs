@@ -8,14 +8,14 @@
 
 use crate::board::{Bias, Direction, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, Done, Errand, Feature, Next, Object, Oid, Response, Safe, Slot, Timer, WorkerId, command,
-    response,
+    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Safe, Timer,
+    command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 
 use super::pace::Pace;
-use lines::Lines;
+use lines::{Lines, Wire};
 use port::Port;
 
 mod lines;
@@ -96,33 +96,23 @@ enum Way {
     Port(Port),
 }
 
-impl Way {
-    /// Lets nothing drive the wire low.
-    fn idle(&self) -> Result<(), Shutdown> {
-        match self {
-            Way::Lines(lines) => lines.idle(),
-            // A port is idle whenever it does not send.
-            Way::Port(_) => Ok(()),
-        }
-    }
-}
+impl Way {}
 
-/// Sends a message and receives its reply. Each UART has one box for them.
-struct Exchange {
-    way: Way,
-    message: Message,
-}
+/// Sends a message and receives its reply.
+#[derive(Default)]
+struct Exchange(Message);
 
-impl Errand for Exchange {
-    type Answer = ();
+impl Job for Exchange {
+    type Device = Way;
+    type Out = ();
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<(), Shutdown> {
-        self.message.replied = false;
-        match &mut self.way {
-            Way::Lines(lines) => lines.exchange(&mut self.message),
+    fn run(&mut self, way: &mut Way) -> Result<(), Shutdown> {
+        self.0.replied = false;
+        match way {
+            Way::Lines(lines) => lines.exchange(&mut self.0),
             Way::Port(port) => {
-                port.exchange(&mut self.message);
+                port.exchange(&mut self.0);
                 Ok(())
             }
         }
@@ -130,9 +120,11 @@ impl Errand for Exchange {
 }
 
 struct TmcUart {
-    worker: WorkerId,
+    way: DeviceId<Way>,
+    /// The wire, if no port drives it. A port is idle whenever it does not send.
+    wire: Option<Wire>,
     pace: Pace,
-    exchange: Slot<Exchange>,
+    exchange: JobSlot<Exchange>,
     /// Whether the host still expects an answer.
     asked: bool,
 }
@@ -148,7 +140,7 @@ impl TmcUart {
                 format_args!("tmcuart_send wants {} bytes sent and {read_len} read, of {DATA_MAX} each", write.len()),
             ));
         }
-        let message = &mut exchange.message;
+        let message = &mut exchange.0;
         message.data[..write.len()].copy_from_slice(write);
         message.write_len = write.len();
         message.read_len = read_len;
@@ -166,19 +158,19 @@ impl Object for TmcUart {
 
     /// Sends the message from a timer, so that no command waits for it.
     fn event(&mut self, context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
-        self.exchange.send(context, self.worker)?;
+        self.exchange.send(context, self.way)?;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, context: &mut Context, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.exchange.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.exchange.back(finished) else { return Ok(()) };
         let result = result.map_err(Shutdown::clone);
         self.pace.resume();
         if std::mem::take(&mut self.asked)
             && result.is_ok()
             && let Some(exchange) = self.exchange.here()
         {
-            context.send(UartResponse { oid: context.oid(), read: exchange.message.reply() });
+            context.send(UartResponse { oid: context.oid(), read: exchange.0.reply() });
         }
         match result {
             Ok(()) => {
@@ -195,13 +187,11 @@ impl Object for TmcUart {
 
     /// Aborts a message under way. The errand then leaves the line idle.
     fn make_safe(&mut self, _context: &mut Context) -> Result<Safe, Shutdown> {
-        match self.exchange.here() {
-            Some(exchange) => exchange.way.idle().map(|()| Safe::Now),
-            None => {
-                self.pace.stop();
-                Ok(Safe::Later)
-            }
+        if self.exchange.is_here() {
+            return self.wire.as_ref().map_or(Ok(()), Wire::idle).map(|()| Safe::Now);
         }
+        self.pace.stop();
+        Ok(Safe::Later)
     }
 }
 
@@ -214,8 +204,8 @@ fn lines(context: &mut Context, rx_pin: Pin, tx_pin: Pin, bias: Bias, bit: Ticks
         let idle = Direction::Output { level: true, shutdown_value: true };
         (context.prompt_line(tx_pin, "UART", idle)?, None)
     };
-    let lines = Lines { tx, rx, single, pace: Pace::new(context), bit, spoilt: false };
-    lines.idle()?;
+    let lines = Lines { wire: Wire { tx, single }, rx, pace: Pace::new(context), bit, spoilt: false };
+    lines.wire.idle()?;
     Ok(lines)
 }
 
@@ -224,7 +214,7 @@ const CONFIG_TMCUART: Command = command!(
     |context, oid: Oid, rx_pin: Pin, pull_up: bool, tx_pin: Pin, bit_time: Ticks| {
         context.vacant(oid)?;
         // The resistors at a port's pins are those of the device tree.
-        let (worker, way, pace) = match context.board()?.serial(rx_pin, rate_hz(bit_time))? {
+        let (way, wire, pace) = match context.board()?.serial(rx_pin, rate_hz(bit_time))? {
             Some(_) if rx_pin != tx_pin => {
                 let (rx, tx) = (context.name(rx_pin), context.name(tx_pin));
                 let cause = format!("it cannot receive on {rx} and send on {tx}, as a serial port does both");
@@ -232,18 +222,17 @@ const CONFIG_TMCUART: Command = command!(
             }
             Some(OnWorker { bus, device }) => {
                 let port = Port::new(device, context.name(rx_pin), bit_time);
-                (context.worker(&bus)?, Way::Port(port), Pace::new(context))
+                (context.device(&bus, Box::new(Way::Port(port)))?, None, Pace::new(context))
             }
             None => {
                 let bias = if pull_up { Bias::PullUp } else { Bias::None };
-                let worker = context.worker(WORKER)?;
                 let lines = lines(context, rx_pin, tx_pin, bias, bit_time)?;
-                let pace = lines.pace.clone();
-                (worker, Way::Lines(lines), pace)
+                let (wire, pace) = (lines.wire.clone(), lines.pace.clone());
+                (context.device(WORKER, Box::new(Way::Lines(lines)))?, Some(wire), pace)
             }
         };
-        let exchange = Slot::new(Exchange { way, message: Message::default() });
-        context.assign_on(tx_pin, oid, TmcUart { worker, pace, exchange, asked: false })
+        let exchange = JobSlot::new(Exchange::default());
+        context.assign_on(tx_pin, oid, TmcUart { way, wire, pace, exchange, asked: false })
     }
 );
 

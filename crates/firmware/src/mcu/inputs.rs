@@ -10,18 +10,19 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
 use super::lines::{Claim, Level, Repeated};
-use super::{Back, Context, Done, Errand, Slot, UNREAD_LIMIT, Unread, WorkerId};
+use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
 use crate::board::Pin;
 
 /// Reads an input of a chip that may sleep.
-struct Sampling(Repeated);
+struct Read;
 
-impl Errand for Sampling {
-    type Answer = bool;
+impl Job for Read {
+    type Device = Repeated;
+    type Out = bool;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<bool, Shutdown> {
-        self.0.read()
+    fn run(&mut self, line: &mut Repeated) -> Result<bool, Shutdown> {
+        line.read()
     }
 }
 
@@ -44,31 +45,32 @@ pub struct InputLine {
 
 enum Sensor {
     Prompt(Arc<dyn Line>),
-    Slow { worker: WorkerId, look: Slot<Sampling>, unread: Unread },
+    Slow { line: DeviceId<Repeated>, look: JobSlot<Read>, unread: Unread },
 }
 
 impl InputLine {
-    pub(super) fn new(claim: &Claim) -> InputLine {
+    /// The object gets the worker's reads back under `number`.
+    pub(super) fn new(number: u8, claim: &Claim) -> InputLine {
         let sensor = match claim.slow() {
             None => Sensor::Prompt(claim.line()),
-            Some((worker, line)) => Sensor::Slow { worker, look: Slot::new(Sampling(line)), unread: Unread::default() },
+            Some(line) => Sensor::Slow { line, look: JobSlot::numbered(number, Read), unread: Unread::default() },
         };
         InputLine { pin: claim.pin(), sensor, level: claim.level() }
     }
 
     /// The line's level. `None` if the chip's worker has to look: the level then comes later, to the object's
-    /// `returned`.
+    /// `finished`.
     ///
     /// # Errors
     ///
     /// "GPIO line read failed".
     #[inline]
     pub fn read(&mut self, context: &mut Context) -> Result<Option<bool>, Shutdown> {
-        if let Sensor::Slow { worker, look, unread } = &mut self.sensor
+        if let Sensor::Slow { line, look, unread } = &mut self.sensor
             && look.is_here()
         {
             unread.asked(context.now());
-            look.send(context, *worker)?;
+            look.send(context, *line)?;
         }
         self.prompt_level()
     }
@@ -91,20 +93,20 @@ impl InputLine {
         matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
     }
 
-    /// Handles a finished look, if it was at this line. It fails with "GPIO line read failed" when no look has
+    /// Handles a finished look. It fails with "GPIO line read failed" when no look has
     /// succeeded for [`UNREAD_LIMIT`].
-    pub fn sampled(&mut self, context: &Context, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(context, done, false)
+    pub fn sampled(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, finished, false)
     }
 
     /// The same, if a move depends on the input. One failed look is a failure at once.
-    pub fn seen(&mut self, context: &Context, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(context, done, true)
+    pub fn seen(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, finished, true)
     }
 
-    fn take_in(&mut self, context: &Context, done: &mut Done, at_once: bool) -> Option<Result<Look, Shutdown>> {
+    fn take_in(&mut self, context: &Context, finished: Finished, at_once: bool) -> Option<Result<Look, Shutdown>> {
         let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
-        let Back { result, began, ended, .. } = look.back(done)?;
+        let Back { result, began, ended, .. } = look.back(finished)?;
         let level = match result {
             Ok(level) => {
                 unread.read();

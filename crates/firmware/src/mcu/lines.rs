@@ -18,7 +18,7 @@ use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line
 use crate::shutdown::{Shutdown, reason};
 
 use super::outputs::Output;
-use super::{Calls, Context, InputLine, LineState, OutputLine, PromptLine, Settable, State, WorkerId};
+use super::{Calls, Context, DeviceId, InputLine, LineState, OutputLine, PromptLine, Settable, State};
 
 /// The GPIO lines in use.
 #[derive(Default)]
@@ -59,8 +59,8 @@ pub(super) struct Claim {
     /// The board's own number for it.
     pin: Pin,
     line: Arc<dyn Line>,
-    /// The worker of its chip and the worker's calls, if calls to that chip may be slow.
-    slow: Option<(WorkerId, Calls)>,
+    /// The line in the worker of its chip and the worker's calls, if calls to that chip may be slow.
+    slow: Option<(DeviceId<Repeated>, Calls)>,
     /// Its last setup, with the shutdown value of an output.
     direction: Direction,
     level: Arc<Level>,
@@ -103,20 +103,17 @@ impl Claim {
         Ok(())
     }
 
-    /// The worker of the line's chip and the line for that worker, if calls to the chip may be slow.
-    pub(super) fn slow(&self) -> Option<(WorkerId, Repeated)> {
-        self.slow.as_ref().map(|(worker, calls)| (*worker, Repeated { line: self.watched(), calls: calls.clone() }))
+    /// The line in the worker of its chip, if calls to that chip may be slow.
+    pub(super) fn slow(&self) -> Option<DeviceId<Repeated>> {
+        self.slow.as_ref().map(|(line, _)| *line)
     }
 
-    fn watched(&self) -> Arc<dyn Line> {
-        Arc::new(Watched { line: self.line.clone(), level: self.level.clone() })
-    }
-
-    /// The line for a user that calls it directly, for example an errand.
+    /// The line for a user that calls it directly, for example a job.
     fn shared(&self) -> Arc<dyn Line> {
-        match self.slow() {
-            None => self.watched(),
-            Some((_, line)) => Arc::new(line),
+        let line = Arc::new(Watched { line: self.line.clone(), level: self.level.clone() });
+        match &self.slow {
+            None => line,
+            Some((_, calls)) => Arc::new(Repeated { line, calls: calls.clone() }),
         }
     }
 }
@@ -304,7 +301,7 @@ impl Settable for Repeated {
 }
 
 /// The counter of a line's edges and the worker that reads it, or the reason why there is none.
-pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
+pub type CountedEdges = Result<DeviceId<dyn Edges>, Box<str>>;
 
 impl State {
     /// Claims a line for one more use, and returns its place. `output`: a feature drives it.
@@ -351,8 +348,15 @@ impl State {
         output: Option<Output>,
     ) -> Result<usize, Shutdown> {
         let ClaimedLine { line, sleeps_on } = claimed;
-        let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
-        let slow = worker.map(|worker| (worker, Calls::new(self.scheduler.clock())));
+        let slow = match sleeps_on {
+            None => None,
+            Some(chip) => {
+                let calls = Calls::new(self.scheduler.clock());
+                let watched = Arc::new(Watched { line: line.clone(), level: level.clone() });
+                let line = Box::new(Repeated { line: watched, calls: calls.clone() });
+                Some((self.device(&chip, line)?, calls))
+            }
+        };
         level.begin(direction);
         self.lines.claims.push(Claim { pin, line, slow, direction, level, output });
         Ok(self.lines.claims.len() - 1)
@@ -386,8 +390,8 @@ impl Context<'_> {
         let place = self.state.claim(pin, direction, Some(output))?;
         let claim = &mut self.state.lines.claims[place];
         let slow = claim.slow();
-        if let (Some(output), Some((worker, line))) = (&mut claim.output, slow) {
-            output.give_writer(place, worker, line, claim.level.is_high());
+        if let (Some(output), Some(line)) = (&mut claim.output, slow) {
+            output.give_writer(place, line, claim.level.is_high());
         }
         Ok(place)
     }
@@ -429,7 +433,7 @@ impl Context<'_> {
         Ok(PromptLine::new(claim))
     }
 
-    /// Claims a line with exact edges, for an errand that drives or reads it. It refuses a chip that may sleep.
+    /// Claims a line with exact edges, for a job that drives or reads it. It refuses a chip that may sleep.
     ///
     /// # Errors
     ///
@@ -477,7 +481,7 @@ impl Context<'_> {
     ///
     /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        self.claim(pin, Direction::Input(bias)).map(InputLine::new)
+        self.claim(pin, Direction::Input(bias)).map(|claim| InputLine::new(0, claim))
     }
 
     /// Claims an input, with edges counted by an interrupt if possible.
@@ -493,9 +497,9 @@ impl Context<'_> {
         let CountedLine { line, edges } = self.state.board.counted_line(own, bias)?;
         let level = Arc::new(Level::unknown());
         let place = self.state.enter(own, line, Direction::Input(bias), level, None)?;
-        let input = InputLine::new(&self.state.lines.claims[place]);
+        let input = InputLine::new(0, &self.state.lines.claims[place]);
         let edges = match edges {
-            Ok(OnWorker { bus, device }) => Ok((self.state.workers.start(&bus)?, device)),
+            Ok(OnWorker { bus, device }) => Ok(self.device(&bus, device)?),
             Err(why) => Err(why),
         };
         Ok((input, edges))
@@ -507,9 +511,9 @@ impl Context<'_> {
     /// # Errors
     ///
     /// The board's errors, for example "Unable to open in GPIO chip line".
-    pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
+    pub fn late_input(&mut self, number: u8, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
         let place = self.state.claim(pin, Direction::Input(bias), None)?;
-        Ok(InputLine::new(&self.state.lines.claims[place]))
+        Ok(InputLine::new(number, &self.state.lines.claims[place]))
     }
 
     /// The pin's name in the dictionary.

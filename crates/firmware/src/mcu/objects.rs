@@ -9,7 +9,7 @@ use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::{Batch, Bus, BusCounts, Context, Done, Mcu, Oid, Report, State, Timer};
+use super::{Batch, Bus, BusCounts, Chip, Context, DeviceId, Finished, Mcu, Oid, Report, State, Timer};
 
 /// The result of an event: what happens to its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,8 +47,8 @@ pub trait Object: Any + Send {
         false
     }
 
-    /// Runs when an errand of this object returns from its worker. An error stops the MCU.
-    fn returned(&mut self, _context: &mut Context, _done: &mut Done) -> Result<(), Shutdown> {
+    /// Runs when the job of this number returns from its worker. An error stops the MCU.
+    fn finished(&mut self, _context: &mut Context, _number: u8, _finished: Finished) -> Result<(), Shutdown> {
         Ok(())
     }
 
@@ -198,8 +198,8 @@ impl State {
     /// # Errors
     ///
     /// "Invalid oid type" if it represents none, or its bus is not set.
-    pub(super) fn lend(&self, oid: Oid) -> Result<Bus, Shutdown> {
-        self.objects.get(oid).and_then(|object| object.bus()).cloned().ok_or_else(|| not_configured(oid))
+    pub(super) fn lend(&self, oid: Oid) -> Result<DeviceId<Chip>, Shutdown> {
+        self.objects.get(oid).and_then(|object| object.bus()).map(Bus::chip).ok_or_else(|| not_configured(oid))
     }
 
     /// Adds the object's name to a shutdown.

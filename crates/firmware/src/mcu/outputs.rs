@@ -11,7 +11,7 @@ use crate::shutdown::Shutdown;
 
 use super::lines::{Claim, Level, Repeated};
 use super::stop::Subject;
-use super::{Batch, Context, Done, Oid, Remote, Safe, State, WorkerId};
+use super::{Batch, Context, DeviceId, Finished, Oid, Remote, Safe, State};
 
 /// An output of an object.
 pub(super) struct Output {
@@ -38,9 +38,9 @@ impl Output {
         Output { writer: self.writer.or(earlier.and_then(|earlier| earlier.writer)), ..self }
     }
 
-    /// Lets this worker write the line, which is at `level`.
-    pub(super) fn give_writer(&mut self, place: usize, worker: WorkerId, line: Repeated, level: bool) {
-        self.writer.get_or_insert_with(|| Remote::of_output(place, worker, line, level));
+    /// Lets a worker write the line, which is at `level`.
+    pub(super) fn give_writer(&mut self, place: usize, line: DeviceId<Repeated>, level: bool) {
+        self.writer.get_or_insert_with(|| Remote::of_output(place, line, level));
     }
 }
 
@@ -156,8 +156,8 @@ impl State {
     }
 
     /// A worker has written an output.
-    pub(super) fn output_returned(&mut self, place: usize, done: &mut Done) -> Result<(), Shutdown> {
-        match self.with_writer(place, |writer, context| writer.back(context, done)).flatten() {
+    pub(super) fn output_written(&mut self, place: usize, finished: Finished) -> Result<(), Shutdown> {
+        match self.with_writer(place, |writer, context| writer.back(context, finished)).flatten() {
             Some(Ok(true)) => self.is_safe(Subject::Output(place)),
             Some(Err(failure)) => return self.device_failed(Subject::Output(place), failure),
             _ => {}

@@ -245,7 +245,7 @@ impl Mcu {
             return false;
         }
         let queues = &mut to.queues;
-        workers.tell(&mut |bus, waiting| {
+        workers.report(&mut |bus, waiting| {
             let mut name = [0; NAME_BYTES];
             name.iter_mut().zip(bus.bytes()).for_each(|(to, from)| *to = from);
             append(queues, QueueState { name, waiting });

@@ -4,6 +4,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::any::Any;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle, Thread};
@@ -12,7 +13,7 @@ use std::time::Duration;
 use log::error;
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
-use pinion_firmware::mcu::{FinishedJob, Refused, SentJob, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, FinishedJob, Refused, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -35,13 +36,21 @@ const END_LIMIT: Duration = Duration::from_secs(2);
 
 struct Worker {
     bus: String,
-    /// The jobs, and when they were submitted.
-    jobs: Producer<(SentJob, Clock)>,
+    jobs: Producer<Message>,
+    devices: usize,
     done: Consumer<FinishedJob>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
     /// Nobody waits for its end.
     left_behind: bool,
+}
+
+/// To a worker.
+enum Message {
+    /// A device that it owns from now on.
+    Device(Box<dyn Any + Send>),
+    /// A job, and when it was submitted.
+    Job(SentJob, Clock),
 }
 
 /// The thread of each new worker calls this first.
@@ -82,8 +91,17 @@ impl Threads {
         let clock = self.clock.clone();
         let polling = PollBudget::new(self.may_poll, clock.now());
         let trace_writer = self.recording.worker(bus);
-        let server =
-            Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, polling, trace_writer };
+        let server = Server {
+            jobs: inbox,
+            devices: Devices::default(),
+            done: outbox,
+            quit: quit.clone(),
+            core,
+            clock,
+            shown,
+            polling,
+            trace_writer,
+        };
         let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
@@ -95,7 +113,7 @@ impl Threads {
                 let trouble = Trouble::new(format!("its thread cannot be started ({error})"));
                 overflow(bus, trouble.remedy("raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })
+        Ok(Worker { bus: bus.into(), jobs, devices: 0, done, quit, thread, left_behind: false })
     }
 }
 
@@ -106,6 +124,10 @@ fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
     Shutdown::because(reason::WORKER_OVERFLOW, why.into().of(format_args!("the worker of {bus}")))
 }
 
+fn no_worker() -> Shutdown {
+    overflow("a bus", Trouble::new("it is not there").remedy(REPORT))
+}
+
 impl Workers for Threads {
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         if let Some(worker) = self.workers.iter().position(|worker| worker.bus == bus) {
@@ -113,6 +135,14 @@ impl Workers for Threads {
         }
         self.workers.push(self.spawn(bus)?);
         Ok(WorkerId(self.workers.len() - 1))
+    }
+
+    fn give(&mut self, WorkerId(worker): WorkerId, device: Box<dyn Any + Send>) -> Result<usize, Shutdown> {
+        let worker = self.workers.get_mut(worker).ok_or_else(no_worker)?;
+        worker.jobs.push(Message::Device(device)).map_err(|_| overflow(&worker.bus, "it has too many devices"))?;
+        worker.thread.thread().unpark();
+        worker.devices += 1;
+        Ok(worker.devices - 1)
     }
 
     fn are_parallel(&self) -> bool {
@@ -127,10 +157,9 @@ impl Workers for Threads {
 
     fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), Refused> {
         let Some(worker) = self.workers.get_mut(worker) else {
-            let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
-            return Err(Refused { job, why });
+            return Err(Refused { job, why: no_worker() });
         };
-        if let Err(PushError::Full((job, _))) = worker.jobs.push((job, self.clock.now())) {
+        if let Err(PushError::Full(Message::Job(job, _))) = worker.jobs.push(Message::Job(job, self.clock.now())) {
             let trouble = Trouble::new("more is asked of it at once than there are devices");
             let why = overflow(&worker.bus, trouble.remedy(REPORT));
             return Err(Refused { job, why });
@@ -147,7 +176,7 @@ impl Workers for Threads {
         self.workers.iter().any(|worker| !worker.done.is_empty())
     }
 
-    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
+    fn report(&self, each: &mut dyn FnMut(&str, usize)) {
         self.workers.iter().for_each(|worker| each(&worker.bus, QUEUE_JOBS - worker.jobs.slots()));
     }
 
@@ -180,7 +209,8 @@ impl Drop for Threads {
 
 /// A worker's thread.
 struct Server {
-    jobs: Consumer<(SentJob, Clock)>,
+    jobs: Consumer<Message>,
+    devices: Devices,
     done: Producer<FinishedJob>,
     quit: Arc<AtomicBool>,
     core: Thread,
@@ -201,7 +231,8 @@ impl Server {
                 return;
             }
             match self.jobs.pop() {
-                Ok((job, submitted)) => self.serve(job, submitted),
+                Ok(Message::Device(device)) => self.devices.add(device),
+                Ok(Message::Job(job, submitted)) => self.serve(job, submitted),
                 Err(_) if ending => return,
                 Err(_) if self.polling.goes_on(self.clock.now()) => thread::yield_now(),
                 Err(_) => thread::park(),
@@ -214,13 +245,13 @@ impl Server {
         let began = self.clock.now();
         let (number, holds) = (job.oid().number(), job.holds());
         self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
-        let ended = self.clock.errand(&mut || job.run());
+        let ended = self.clock.errand(&mut || job.run(&mut self.devices));
         self.shown.end();
         self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
         // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
         let _ = self.done.push(FinishedJob { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
-        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds())) {
+        if !(holds && self.jobs.peek().is_ok_and(|next| matches!(next, Message::Job(next, _) if next.holds()))) {
             self.core.unpark();
         }
         // Samples, which timers ask for, come at their own pace.
@@ -239,7 +270,7 @@ impl Server {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::mcu::{Oid, Parcel};
+    use pinion_firmware::mcu::{AnyJob, Oid};
     use pinion_linux::clock::Monotonic;
     use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
@@ -251,8 +282,8 @@ mod tests {
         said: Sender<u8>,
     }
 
-    impl Parcel for Slow {
-        fn run(&mut self) {
+    impl AnyJob for Slow {
+        fn run(&mut self, _devices: &mut Devices) {
             let _ = self.go_on.lock().unwrap().recv();
             let _ = self.said.send(self.number);
         }
@@ -278,12 +309,12 @@ mod tests {
 
     struct Quick;
 
-    impl Parcel for Quick {
-        fn run(&mut self) {}
+    impl AnyJob for Quick {
+        fn run(&mut self, _devices: &mut Devices) {}
     }
 
-    fn submit(threads: &mut Threads, worker: WorkerId, parcel: Box<dyn Parcel>, holds: bool) {
-        let taken = threads.submit(worker, SentJob::new(Oid::new(0), parcel, holds));
+    fn submit(threads: &mut Threads, worker: WorkerId, job: Box<dyn AnyJob>, holds: bool) {
+        let taken = threads.submit(worker, SentJob::new(Oid::new(0), 0, job, holds));
         assert!(taken.is_ok());
     }
 

@@ -18,7 +18,7 @@ use pinion_sync::watch::Watch;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::between_ticks;
-use crate::mcu::{Context, Errand};
+use crate::mcu::{Context, Job};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
@@ -74,6 +74,11 @@ impl Shift {
             name: context.name(sclk_pin),
             told: false,
         }
+    }
+
+    /// Sets the clock line while no sample is shifted out.
+    pub(super) fn power_down(&self, down: bool) -> Result<(), Shutdown> {
+        self.sclk.write(down)
     }
 
     pub(super) fn run(&mut self) -> Result<Shifted, Shutdown> {
@@ -170,10 +175,20 @@ impl Watcher {
     }
 }
 
-impl Errand for Watcher {
-    type Answer = ();
+/// Lets the watcher watch a reading.
+pub(super) struct WatchReading;
+
+impl Job for WatchReading {
+    type Device = Watcher;
+    type Out = ();
     type Failure = Shutdown;
 
+    fn run(&mut self, watcher: &mut Watcher) -> Result<(), Shutdown> {
+        watcher.run()
+    }
+}
+
+impl Watcher {
     fn run(&mut self) -> Result<(), Shutdown> {
         // The pulse that is watched, and since when.
         let (mut pulse, mut since) = (0, self.time.now());
