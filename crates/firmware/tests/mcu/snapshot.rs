@@ -44,7 +44,8 @@ fn levels_are_those_of_the_last_write_or_look() {
         rig.send("emergency_stop");
         let stopped = tell(&rig);
         assert!(stopped.stopped.is_some() && stopped.detail.starts_with("the host asked for it"));
-        assert_eq!(level(&rig, 200).1, Some(false), "the shutdown value");
+        rig.run_until(rig.now() + u64::from(answer_ticks));
+        assert_eq!(level(&rig, 200).1, Some(false), "the shutdown value, once it is written");
         rig.send("config_reset");
         let anew = tell(&rig);
         assert!(anew.stopped.is_none() && anew.detail.is_empty() && anew.lines.is_empty() && anew.objects.is_empty());
