@@ -53,7 +53,7 @@ pub const MESSAGE_MAX: usize = 512;
 /// Bytes and their number, kept without an allocation.
 type Message = ([u8; MESSAGE_MAX], usize);
 
-/// A conversation with an SPI chip.
+/// A transfer with an SPI chip.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Transfer {
     /// When it began, in ticks.
@@ -97,7 +97,7 @@ pub struct State {
     i2c_chips: HashMap<(u32, u8), I2cChip>,
     /// The last direction of each claimed pin.
     pub directions: HashMap<u32, Direction>,
-    /// The changes of direction during conversations, in order.
+    /// The changes of direction within messages, in order.
     pub turns: Vec<(u32, Direction)>,
     /// Inputs with edges that an interrupt counts.
     pub counted: HashSet<u32>,
@@ -105,7 +105,7 @@ pub struct State {
     pub sleeping: HashSet<u32>,
     /// Lines that are written and read without a call of the kernel.
     pub fast: HashSet<u32>,
-    /// Whether an errand is running. Only then may lines that sleep be called.
+    /// Whether a job is running. Only then may lines that sleep be called.
     on_worker: bool,
     /// ADC and PWM channels in use.
     pub claimed: HashSet<u32>,
@@ -144,12 +144,12 @@ pub struct State {
     pub link: Option<SleepyLink>,
     /// How long a device on a worker takes to answer; 0 by default.
     pub answer_ticks: u32,
-    /// Whether the workers' queues are full and refuse errands.
+    /// Whether the workers' queues are full and refuse jobs.
     pub refuses: bool,
-    /// How long each byte takes on a bus. If it is not 0, an errand runs as soon as it is submitted. Its chip gets the
+    /// How long each byte takes on a bus. If it is not 0, a job runs as soon as it is submitted. Its chip gets the
     /// times at which its transfers will begin.
     pub byte_ticks: u32,
-    /// The time that the running errand has reached, if [`State::byte_ticks`] is not 0.
+    /// The time that the running job has reached, if [`State::byte_ticks`] is not 0.
     bus_now: Option<Clock>,
 }
 
@@ -187,7 +187,7 @@ pub struct Bench {
     state: Arc<Mutex<State>>,
     gate: Arc<Gate>,
     clock: VirtualClock,
-    /// How many ticks ago the worker ran the present errand. The core may have stood still since then.
+    /// How many ticks ago the worker ran the present job. The core may have stood still since then.
     ago: Arc<AtomicU32>,
     /// A test's times count from here.
     origin: Clock,
@@ -196,7 +196,7 @@ pub struct Bench {
 /// Lets the SPI chips hang, in tests in real time.
 #[derive(Default)]
 struct Gate {
-    /// Whether it is closed, and whether a conversation waits at it.
+    /// Whether it is closed, and whether a transfer waits at it.
     state: Mutex<(bool, bool)>,
     changed: Condvar,
 }
@@ -217,7 +217,7 @@ impl Bench {
         self.gate.changed.notify_all();
     }
 
-    /// Whether a conversation hangs.
+    /// Whether a transfer hangs.
     pub fn hangs(&self) -> bool {
         self.gate.state.lock().unwrap().1
     }
@@ -263,7 +263,7 @@ impl Bench {
         self.clock.set(self.clock.now() + ticks);
     }
 
-    /// When a conversation of `bytes` bytes begins.
+    /// When a transfer of `bytes` bytes begins.
     fn bus_ticks(&self, bytes: usize) -> u64 {
         let mut state = self.state();
         let takes = Ticks(state.byte_ticks * bytes as u32);
@@ -824,7 +824,7 @@ impl BusDevice for FakeSpi {
     }
 }
 
-/// Workers in virtual time. The errands of one bus run one after the other, and each takes its time.
+/// Workers in virtual time. The jobs of one bus run one after the other, and each takes its time.
 #[derive(Clone)]
 pub struct FakeWorkers {
     bench: Bench,
@@ -835,11 +835,11 @@ struct Shop {
     buses: Vec<Bus>,
     /// In the order of their end times.
     under_way: VecDeque<UnderWay>,
-    /// Errands that hung when the workers were reset.
+    /// Jobs that hung when the workers were reset.
     left_behind: Vec<UnderWay>,
 }
 
-/// An errand on its way.
+/// A job on its way.
 struct UnderWay {
     worker: usize,
     begin: Clock,
@@ -863,7 +863,7 @@ enum Work {
 }
 
 impl Shop {
-    /// Reserves memory for more errands than a test sends, because the bench must not allocate later.
+    /// Reserves memory for more jobs than a test sends, because the bench must not allocate later.
     fn new() -> Shop {
         Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256), left_behind: Vec::new() }
     }
@@ -873,7 +873,7 @@ impl Shop {
         uncounted(|| self.under_way.insert(place, new));
     }
 
-    /// Delays the errands after one that ran for a time of its own on this worker.
+    /// Delays the jobs after one that ran for a time of its own on this worker.
     fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
         let free = &mut self.buses[worker].free;
         *free = (*free).max(ended);
@@ -892,12 +892,12 @@ impl FakeWorkers {
         FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
     }
 
-    /// How many errands are on their way.
+    /// How many jobs are on their way.
     pub fn under_way(&self) -> usize {
         self.shop.lock().unwrap().under_way.len()
     }
 
-    /// When the next errand ends.
+    /// When the next job ends.
     pub fn next_end(&self) -> Option<Clock> {
         self.shop.lock().unwrap().under_way.front().map(|next| next.end)
     }
@@ -944,7 +944,7 @@ impl Workers for FakeWorkers {
         Ok(())
     }
 
-    /// An errand calls its device at its own end, unless bytes take time. An errand that keeps time itself goes on from
+    /// A job calls its device at its own end, unless bytes take time. A job that keeps time itself goes on from
     /// there in a time of its own. It is finished when that time has come.
     fn completion(&mut self) -> Option<FinishedJob> {
         while self.has_completion() {
@@ -959,7 +959,7 @@ impl Workers for FakeWorkers {
             // A worker may take memory, for example for the words of what failed.
             let taken = || self.shop.lock().unwrap().buses[worker].devices.take();
             let mut devices = taken().expect("no other job runs");
-            let ended = uncounted(|| self.bench.clock.errand(&mut || job.run(&mut devices))) - ago;
+            let ended = uncounted(|| self.bench.clock.run_job(&mut || job.run(&mut devices))) - ago;
             self.shop.lock().unwrap().buses[worker].devices = Some(devices);
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;

@@ -12,12 +12,10 @@
 
 use std::sync::Arc;
 
-use log::warn;
-
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, InputLine, Job, JobSlot, Look, Next, Object, Oid, Response,
-    Timer, WireClock, command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, InputLine, Job, JobSlot, Look, Next, Object,
+    Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -93,6 +91,9 @@ impl Settling {
     }
 }
 
+/// The first word of each warning.
+const SUBJECT: &str = "counter";
+
 /// Reads the edges that the kernel has timestamped.
 struct Reading {
     clock: Arc<dyn TimeSource>,
@@ -107,6 +108,7 @@ struct Reading {
     interrupts: u32,
     /// Whether there were too many, so that the interrupts are switched off.
     given_up: bool,
+    warning: Option<DeviceWarning>,
 }
 
 impl Job for Reading {
@@ -134,23 +136,27 @@ impl Job for Reading {
             if per_s > u64::from(EDGES_PER_S_MAX) {
                 edges.end()?;
                 self.given_up = true;
-                warn!("{}", too_many(&self.name, per_s));
+                self.warning = Some(DeviceWarning::new(SUBJECT, too_many(&self.name, per_s)));
             }
         }
         Ok((self.settling.count, self.settling.last))
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
 /// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
-        "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
+        "{SUBJECT} ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
     )
 }
 
 /// For the log: nothing else counts a pin's edges, so it is polled.
 fn polled(name: &str, why: &str) -> String {
-    format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
+    format!("{SUBJECT} ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
 /// The kernel's edges, and the job that reads them.
@@ -234,7 +240,7 @@ impl Object for Counter {
                 self.next_sample = at + self.sample_ticks.max(self.poll_ticks);
                 self.counts = true;
             }
-            // A worker that is still reading misses this turn.
+            // A worker that is still reading misses this read.
             if let Some(ready) = reading.here() {
                 ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
                 reading.send(context, *edges)?;
@@ -291,11 +297,12 @@ const CONFIG_COUNTER: Command =
                     since: context.now(),
                     interrupts: 0,
                     given_up: false,
+                    warning: None,
                 };
                 Some(Counted { edges, reading: JobSlot::numbered(READING, reading) })
             }
             Err(why) => {
-                warn!("{}", polled(&name, &why));
+                context.warn_of_device(&DeviceWarning::new(SUBJECT, polled(&name, &why)));
                 None
             }
         };

@@ -40,7 +40,7 @@ pub(super) enum Update {
     Idle,
 }
 
-/// A panel and the pace of its errands.
+/// A panel and the pace of its jobs.
 struct Paced<P> {
     panel: P,
     pace: Pace,
@@ -139,7 +139,7 @@ impl Busy {
         Busy { pace, since: None }
     }
 
-    /// Waits until `ticks` after the last byte. False: the errand must end.
+    /// Waits until `ticks` after the last byte. False: the job must end.
     pub(super) fn over(&self, ticks: Ticks) -> bool {
         self.pace.until(self.since.map_or_else(|| self.pace.now(), |since| since + ticks))
     }

@@ -4,7 +4,7 @@
 //!
 //! A reading takes the samples that are there, at most those of one message. So other devices on the bus get their
 //! turn. If the chip has more, the next reading follows at once, otherwise after `rest_ticks`. For hosts up to v0.12
-//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all conversations of a bus in order,
+//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all jobs of a bus in order,
 //! and returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
 #![forbid(unsafe_code)]
@@ -80,7 +80,7 @@ impl BusType {
         }
     }
 
-    /// The shutdown for a sensor's failed conversation.
+    /// The shutdown for a sensor's failed job.
     pub(super) fn failed(self, context: &Context, error: BusError) -> Shutdown {
         match self {
             BusType::Spi => spi_shutdown(error),
@@ -244,7 +244,7 @@ impl<C: FifoChip> Job for LookAtFill<C> {
     }
 }
 
-/// Asks for overflows, if a separate register reports them. This is a separate conversation: the time of a status is
+/// Asks for overflows, if a separate register reports them. This is a separate job: the time of a status is
 /// the time of the question for the fill level alone.
 struct LookForOverflow<C>(C);
 

@@ -13,8 +13,8 @@
 
 use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Generation::Kalico, Generation::Master, Generation::V0_13,
-    Job, JobSlot, Oid, Remote, Settable, command, since,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Job, JobSlot, Oid, Remote, Settable, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -48,6 +48,8 @@ const ERROR_DESYNC: i32 = i32::MIN;
 const ERROR_READ_TOO_LONG: i32 = 1 << 30;
 
 const SAMPLE_BITS: u8 = 24;
+/// The first words of each warning.
+const SUBJECT: &str = "HX71x sclk";
 /// All of these chips share this worker.
 const WORKER: &str = "hx71x";
 /// Their watchers share this one.
@@ -77,8 +79,20 @@ enum Way {
     Spi(Waves),
 }
 
+impl Way {
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        match self {
+            Way::Lines(shift) => shift.warning.take(),
+            Way::Spi(waves) => waves.warning.take(),
+        }
+    }
+}
+
 /// Reads a sample.
-struct Read;
+#[derive(Default)]
+struct Read {
+    warning: Option<DeviceWarning>,
+}
 
 impl Job for Read {
     type Device = Way;
@@ -87,10 +101,16 @@ impl Job for Read {
     type Failure = Shutdown;
 
     fn run(&mut self, way: &mut Way) -> Result<Option<Shifted>, Shutdown> {
-        match way {
+        let read = match way {
             Way::Lines(shift) => shift.run().map(Some),
             Way::Spi(waves) => waves.run(),
-        }
+        };
+        self.warning = way.take_warning();
+        read
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
@@ -197,7 +217,7 @@ fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, s
         };
         let way = context.device(&bus, Box::new(Way::Spi(Waves::new(device, pulses, sclk))))?;
         let chip = Hx71x::new(way, gain_channel, None);
-        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, Read));
+        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, Read::default()));
     }
     let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
@@ -212,7 +232,7 @@ fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, s
         None => None,
     };
     let chip = Hx71x::new(way, gain_channel, watch);
-    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Read))
+    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Read::default()))
 }
 
 type Sensor = ReadyAdc<Hx71x>;

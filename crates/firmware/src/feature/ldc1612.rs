@@ -192,7 +192,7 @@ struct Ldc1612 {
     bulk: SensorBulk,
     attached: Attached,
     homing: Homing,
-    /// Whether the last conversation failed. Only the first failure is logged.
+    /// Whether the last job failed. Only the first failure is logged.
     failing: bool,
 }
 
@@ -216,7 +216,7 @@ impl Ldc1612 {
         context.assign(oid, sensor)
     }
 
-    /// Logs a failure of the bus if the conversation before did not fail, or stops the MCU.
+    /// Logs a failure of the bus if the job before did not fail, or stops the MCU.
     fn note(failing: &mut bool, context: &mut Context, failure: Option<&BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(failing, failure.is_some());
         let Some(error) = failure else { return Ok(()) };

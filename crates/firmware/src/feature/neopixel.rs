@@ -9,7 +9,8 @@
 
 use crate::board::{Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Object, Oid, Response, command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Object, Oid, Response, command,
+    response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -53,7 +54,10 @@ enum Way {
 }
 
 /// Sends the chain's colors.
-struct Frame(Vec<u8>);
+struct Frame {
+    data: Vec<u8>,
+    warning: Option<DeviceWarning>,
+}
 
 impl Job for Frame {
     type Device = Way;
@@ -63,9 +67,17 @@ impl Job for Frame {
 
     fn run(&mut self, way: &mut Way) -> Result<bool, Shutdown> {
         match way {
-            Way::Spi(waves) => waves.send(&self.0).map(|()| true),
-            Way::Line(pulses) => pulses.send(&self.0),
+            Way::Spi(waves) => waves.send(&self.data).map(|()| true),
+            Way::Line(pulses) => {
+                let sent = pulses.send(&self.data);
+                self.warning = pulses.warning.take();
+                sent
+            }
         }
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
@@ -95,7 +107,7 @@ impl Neopixel {
         let Some(frame) = self.frame.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
         };
-        frame.0.copy_from_slice(&self.data);
+        frame.data.copy_from_slice(&self.data);
         self.frame.send(context, self.way)
     }
 }
@@ -128,7 +140,7 @@ fn way(context: &mut Context, pin: Pin, size: usize, bit_max: Ticks, reset: Tick
     let Mosi { line: OnWorker { bus, device }, message_max, pauses } = mosi;
     let waves = Waves::new(device, size, reset, message_max).map_err(|error| error.of(&context.name(pin)))?;
     if let Some(trouble) = pauses {
-        log::warn!("{trouble}");
+        context.warn_of_device(&DeviceWarning::new("", trouble));
     }
     context.device(&bus, Box::new(Way::Spi(waves)))
 }
@@ -142,7 +154,7 @@ const CONFIG_NEOPIXEL: Command = command!(
         }
         let size = usize::from(data_size);
         let way = way(context, pin, size, bit_max_ticks, reset_min_ticks.max(RESET_MIN))?;
-        let frame = JobSlot::new(Frame(vec![0; size]));
+        let frame = JobSlot::new(Frame { data: vec![0; size], warning: None });
         context.assign_on(pin, oid, Neopixel { way, data: vec![0; size], frame, failing: false })
     }
 );

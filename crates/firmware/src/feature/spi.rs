@@ -143,6 +143,8 @@ pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
     messages: [JobSlot<Message>; UNDER_WAY_MAX],
+    /// The next of them. They return in the order in which they were sent.
+    next: usize,
     round: Round,
 }
 
@@ -152,7 +154,7 @@ impl Spi {
         let messages = std::array::from_fn(|number| {
             JobSlot::numbered(number as u8, Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
         });
-        Spi { bus: None, chip_select, messages, round }
+        Spi { bus: None, chip_select, messages, next: 0, round }
     }
 
     /// Whether the device has a chip select line of its own.
@@ -209,15 +211,19 @@ impl Spi {
             }
             return Ok(());
         };
-        // A slot is free, unless a bus has been hanging since before a stop.
-        let Some(slot) = self.messages.iter_mut().find(|slot| slot.is_here()) else {
+        let slot = &mut self.messages[self.next];
+        // It is here, unless a bus has been hanging since before a stop.
+        let Some(message) = slot.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
-        if let Some(message) = slot.here() {
-            message.number = self.round.number();
-            if answers { message.transfer.load(data) } else { message.transfer.load_to_send(data) }
+        message.number = self.round.number();
+        if answers {
+            message.transfer.load(data)
+        } else {
+            message.transfer.load_to_send(data)
         }
         slot.send(context, bus.chip())?;
+        self.next = (self.next + 1) % UNDER_WAY_MAX;
         if !answers {
             context.let_join(UNDER_WAY_MAX as u32);
         }
@@ -230,7 +236,7 @@ fn invalid(what: impl fmt::Display) -> Shutdown {
     Shutdown::by_host(INVALID_SPI, what)
 }
 
-/// The shutdown for a failed SPI conversation. It does not convert every `BusError`: an I2C bus has its own texts
+/// The shutdown for a failed SPI transfer. It does not convert every `BusError`: an I2C bus has its own texts
 /// (`i2c_shutdown`).
 pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
     Shutdown::because(SPI_TRANSFER_FAILED, error.trouble)

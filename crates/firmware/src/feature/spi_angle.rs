@@ -301,14 +301,14 @@ impl SpiAngle {
     }
 
     fn say(&mut self, context: &mut Context, message: &[u8]) -> Result<(), Shutdown> {
-        // Nothing else is under way, so the conversation is here.
+        // Nothing else is under way, so the job is here.
         if let Some(measurement) = self.measurement.here() {
             measurement.load(message);
         }
         self.measurement.send_to(context, self.spi)
     }
 
-    /// Processes the end of a conversation. Returns true if the request is finished.
+    /// Processes the end of a job. Returns true if the request is finished.
     fn take_in(&mut self, context: &mut Context, began: Clock, ended: Clock) -> Result<bool, Shutdown> {
         let Some(Asking { purpose, latched }) = &mut self.asking else { return Ok(true) };
         let too_slow = ended.since(began) > i64::from(TRANSFER_MAX.0);
@@ -386,7 +386,7 @@ impl SpiAngle {
     }
 
     fn ask(&mut self, context: &mut Context, data: &[u8]) -> Result<(), Shutdown> {
-        // Commands wait for each other, so the conversation is here. One from before a stop may still be under way.
+        // Commands wait for each other, so the job is here. One from before a stop may still be under way.
         let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
         };

@@ -153,7 +153,7 @@ struct Thermocouple {
     max_value: u32,
     max_invalid_count: u8,
     invalid_count: u8,
-    /// When the turn after the current look is due.
+    /// When the next read is due.
     next_clock: Clock,
 }
 
@@ -192,7 +192,7 @@ impl Object for Thermocouple {
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
-        // A chip that is still being read misses this turn.
+        // A chip that is still being read misses this one.
         if self.look.is_here() {
             self.next_clock = next;
             self.look.send_to(context, self.spi)?;

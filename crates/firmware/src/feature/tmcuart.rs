@@ -8,8 +8,8 @@
 
 use crate::board::{Bias, Direction, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Safe, Timer,
-    command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response,
+    Safe, Timer, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -100,7 +100,10 @@ impl Way {}
 
 /// Sends a message and receives its reply.
 #[derive(Default)]
-struct Exchange(Message);
+struct Exchange {
+    message: Message,
+    warning: Option<DeviceWarning>,
+}
 
 impl Job for Exchange {
     type Device = Way;
@@ -108,14 +111,19 @@ impl Job for Exchange {
     type Failure = Shutdown;
 
     fn run(&mut self, way: &mut Way) -> Result<(), Shutdown> {
-        self.0.replied = false;
+        self.message.replied = false;
         match way {
-            Way::Lines(lines) => lines.exchange(&mut self.0),
+            Way::Lines(lines) => lines.exchange(&mut self.message),
             Way::Port(port) => {
-                port.exchange(&mut self.0);
+                port.exchange(&mut self.message);
+                self.warning = port.warning.take();
                 Ok(())
             }
         }
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
@@ -140,7 +148,7 @@ impl TmcUart {
                 format_args!("tmcuart_send wants {} bytes sent and {read_len} read, of {DATA_MAX} each", write.len()),
             ));
         }
-        let message = &mut exchange.0;
+        let message = &mut exchange.message;
         message.data[..write.len()].copy_from_slice(write);
         message.write_len = write.len();
         message.read_len = read_len;
@@ -170,7 +178,7 @@ impl Object for TmcUart {
             && result.is_ok()
             && let Some(exchange) = self.exchange.here()
         {
-            context.send(UartResponse { oid: context.oid(), read: exchange.0.reply() });
+            context.send(UartResponse { oid: context.oid(), read: exchange.message.reply() });
         }
         match result {
             Ok(()) => {
@@ -185,7 +193,7 @@ impl Object for TmcUart {
         self.asked = false;
     }
 
-    /// Aborts a message under way. The errand then leaves the line idle.
+    /// Aborts a message under way. The job then leaves the line idle.
     fn make_safe(&mut self, _context: &mut Context) -> Result<Safe, Shutdown> {
         if self.exchange.is_here() {
             return self.wire.as_ref().map_or(Ok(()), Wire::idle).map(|()| Safe::Now);

@@ -72,7 +72,7 @@ impl Trsync {
         });
     }
 
-    /// Adds the object whose turn it is to the objects that wait for the trigger.
+    /// Adds the object of this context to the objects that wait for the trigger.
     ///
     /// # Errors
     ///
@@ -88,7 +88,7 @@ impl Trsync {
         })
     }
 
-    /// Whether this trsync can still be triggered, and the object whose turn it is waits for it.
+    /// Whether this trsync can still be triggered, and the object of this context waits for it.
     pub(super) fn may_stop(context: &mut Context, trsync: Oid) -> bool {
         let waiting = context.oid();
         let may = |trsync: &mut Trsync, _: &mut Context| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));

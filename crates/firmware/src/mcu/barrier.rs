@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One order: commands wait for the conversations that commands began.
+//! One order: commands wait for the jobs that commands began.
 //!
 //! The firmware runs a command to its end before it looks at the next one. It acknowledges a block after the block's
-//! last command. klippy relies on both. So an errand that a command sends *holds*: the core runs no further command
-//! until the errand is back, and does not acknowledge the block ([`Mcu::is_held`]). Timers go on, and errands that they
+//! last command. klippy relies on both. So a job that a command sends *holds*: the core runs no further command
+//! until the job is back, and does not acknowledge the block ([`Mcu::is_held`]). Timers go on, and jobs that they
 //! send hold nothing. A stopped MCU is not held.
 //!
-//! A command without an answer (`spi_send`) lets other commands to its object join ([`Mcu::may_run`]). Their errands
+//! A command without an answer (`spi_send`) lets other commands to its object join ([`Mcu::may_run`]). Their jobs
 //! follow its own on the same bus, in their order. Its block is finished at once. All other commands wait for the last
-//! of these errands. So a display costs one wake-up for several messages.
+//! of these jobs. So a display costs one wake-up for several messages.
 
 #![forbid(unsafe_code)]
 
@@ -19,7 +19,7 @@ use pinion_protocol::vlq::Reader;
 
 use super::{Mcu, Oid, State, TimerId};
 
-/// How long commands may wait for an errand before the MCU stops. klippy also gives up waiting for an answer after five
+/// How long commands may wait for a job before the MCU stops. klippy also gives up waiting for an answer after five
 /// seconds (`SerialRetryCommand` in serialhdl.py). Without this limit, a bus that hangs would keep the host from
 /// stopping the MCU. Once the host's window of unacknowledged blocks is full, the host cannot even send an
 /// `emergency_stop`.
@@ -28,13 +28,13 @@ const HOLD_LIMIT: Ticks = Ticks::from_ms(5000);
 /// The holds that make commands wait.
 #[derive(Default)]
 pub(super) struct Barrier {
-    /// Whether a command runs now, or the MCU takes back an errand that a command sent.
+    /// Whether a command runs now, or the MCU takes back a job that a command sent.
     is_commanded: bool,
-    /// Errands that commands wait for.
+    /// Jobs that commands wait for.
     count: u32,
     /// The object that sent the last of them.
     holder: Option<Oid>,
-    /// Highest number of errands, if the holder lets others join; else 0.
+    /// Highest number of jobs, if the holder lets others join; else 0.
     join_limit: u32,
 }
 
@@ -53,7 +53,7 @@ impl Barrier {
         self.is_commanded = false;
     }
 
-    /// An errand is back. If a command sent it, the errands that its object sends now also belong to the command.
+    /// A job is back. If a command sent it, the jobs that its object sends now also belong to the command.
     pub(super) fn take_back(&mut self, holds: bool) {
         self.is_commanded = holds;
     }
@@ -63,7 +63,7 @@ impl Barrier {
         self.join_limit = limit;
     }
 
-    /// Whether commands wait for errands.
+    /// Whether commands wait for jobs.
     #[inline]
     fn is_closed(&self) -> bool {
         self.count > 0
@@ -110,7 +110,7 @@ impl State {
         self.barrier.is_closed() & !self.phase.is_stopped() | self.phase.is_reset_due()
     }
 
-    /// Called after a stop. An errand from before the stop holds commands again, and its limit may have passed.
+    /// Called after a stop. A job from before the stop holds commands again, and its limit may have passed.
     pub(super) fn hold_again(&mut self) {
         if self.barrier.is_closed() {
             self.limit_hold();
@@ -119,7 +119,7 @@ impl State {
 }
 
 impl Mcu {
-    /// Whether no further command may run now. Either a command's errand is on its way, or a `config_reset` waits for
+    /// Whether no further command may run now. Either a command's job is on its way, or a `config_reset` waits for
     /// the outputs.
     #[inline]
     pub fn is_held(&self) -> bool {
@@ -151,7 +151,7 @@ impl Mcu {
                 .is_ok_and(|oid| self.state.barrier.holder.is_some_and(|holder| holder.index() == oid as usize))
     }
 
-    /// Runs when the timer of [`HOLD_LIMIT`] is due: commands have waited too long for an errand.
+    /// Runs when the timer of [`HOLD_LIMIT`] is due: commands have waited too long for a job.
     pub(super) fn held_too_long(&mut self) {
         if self.is_held() {
             let holder = self.state.barrier.holder.and_then(|oid| Some((oid, self.state.objects.get(oid)?.kind())));

@@ -49,7 +49,7 @@ impl Command {
         self
     }
 
-    /// Lets the command run while other commands wait for an errand of the same kind of command. Their object must [let
+    /// Lets the command run while other commands wait for a job of the same kind of command. Their object must [let
     /// others join](super::Context::let_join). The first parameter must be the oid.
     pub const fn joining(mut self) -> Command {
         self.joins = true;

@@ -9,6 +9,7 @@ use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
 use super::stop::Subject;
+use super::{DeviceWarning, Note};
 use super::{Dialect, Generations, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 
 /// What a feature may do in a call. The timers and jobs that an object starts here are its own.
@@ -161,6 +162,11 @@ impl<'a> Context<'a> {
     /// Logs a failure of the object that does not stop the MCU.
     pub fn warn(&mut self, kind: &str, trouble: Shutdown) {
         self.state.warn(self.oid, kind, trouble);
+    }
+
+    /// Logs a warning about a device.
+    pub fn warn_of_device(&mut self, warning: &DeviceWarning) {
+        self.state.wire.note(Note::Device(warning));
     }
 
     /// Call this after answering [`Safe::Later`](super::Safe::Later), when the object's outputs are at their shutdown

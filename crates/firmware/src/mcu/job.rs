@@ -18,7 +18,7 @@ use crate::board::OnWorker;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::{Context, Hold, Mcu, Oid, State};
+use super::{Context, DeviceWarning, Hold, Mcu, Note, Oid, State};
 
 #[cfg(doc)]
 use super::{JobSlot, Object};
@@ -38,6 +38,11 @@ pub trait Job: Send + 'static {
     ///
     /// The errors of the device.
     fn run(&mut self, device: &mut Self::Device) -> Result<Self::Out, Self::Failure>;
+
+    /// A warning for the log, from the last run. Runs in the core.
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        None
+    }
 }
 
 /// A device, which lives in its worker.
@@ -74,6 +79,11 @@ impl Devices {
 pub trait AnyJob: Any + Send {
     /// Does the work, and keeps its result. Runs on a worker.
     fn run(&mut self, devices: &mut Devices);
+
+    /// See [`Job::take_warning`].
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        None
+    }
 }
 
 /// A job in the box in which it travels, with its last result.
@@ -92,6 +102,10 @@ impl<J: Job> Boxed<J> {
 impl<J: Job> AnyJob for Boxed<J> {
     fn run(&mut self, devices: &mut Devices) {
         self.outcome = devices.get(self.place).map(|device| self.job.run(device));
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.job.take_warning()
     }
 }
 
@@ -287,7 +301,10 @@ impl Mcu {
     }
 
     fn take_back(&mut self, FinishedJob { job: sent, began, ended }: FinishedJob) {
-        let SentJob { oid, receiver, job, holds } = sent;
+        let SentJob { oid, receiver, mut job, holds } = sent;
+        if let Some(warning) = job.take_warning() {
+            self.state.wire.note(Note::Device(&warning));
+        }
         let finished = Finished { job, began, ended };
         let state = &mut self.state;
         state.barrier.take_back(holds);

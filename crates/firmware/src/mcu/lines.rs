@@ -227,7 +227,7 @@ impl Line for Recorded {
     }
 }
 
-/// A line that records its level for the status when an errand drives or reads it. Errands measure the time between
+/// A line that records its level for the status when a job drives or reads it. Jobs measure the time between
 /// edges, so a write returns when it has reached the line.
 struct Watched {
     line: Arc<dyn Line>,

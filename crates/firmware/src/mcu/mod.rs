@@ -55,7 +55,7 @@ pub use job_slot::{Back, JobSlot};
 pub use lines::EdgeRecorder;
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
 pub use objects::{Next, Object, Safe};
-pub use outbox::{Note, Outbox};
+pub use outbox::{DeviceWarning, Note, Outbox};
 pub use outputs::{OutputLine, PromptLine};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};

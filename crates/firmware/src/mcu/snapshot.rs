@@ -41,8 +41,8 @@ pub struct Snapshot {
     pub stopped: Option<(ShutdownReason, Clock)>,
     /// The cause and remedy of the stop, as in the log.
     pub detail: String,
-    /// The object that still owes a shutdown value; empty if there is none.
-    pub debtor: String,
+    /// The object whose shutdown value is pending; empty if there is none.
+    pub pending: String,
     /// Whether commands wait for a bus.
     pub is_held: bool,
     /// How many moves are queued, and how many there are in all.
@@ -169,7 +169,7 @@ impl Default for Snapshot {
             dialect: None,
             stopped: None,
             detail: String::with_capacity(TEXT_BYTES),
-            debtor: String::with_capacity(TEXT_BYTES),
+            pending: String::with_capacity(TEXT_BYTES),
             is_held: false,
             moves: (0, 0),
             lateness: Lateness::default(),
@@ -264,7 +264,7 @@ impl Mcu {
             Some((why, _)) => put(&mut to.detail, &why.trouble),
             None => to.detail.clear(),
         }
-        put(&mut to.debtor, self.debtor().unwrap_or_default());
+        put(&mut to.pending, self.pending_value().unwrap_or_default());
         to.is_held = self.is_held();
         to.moves = moves.used();
         to.lateness.clone_from(scheduler.lateness());

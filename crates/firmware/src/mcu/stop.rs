@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How the MCU stops. It removes timers, drives outputs to their shutdown values and informs the host.
 //!
-//! A shutdown value that cannot be written at once is *owed*: a worker has to write it, or the write failed. A failed
-//! write is retried every [`RETRY_TICKS`]. The program watches [`Mcu::debtor`]: the guardian handles a debt that lasts.
+//! A stop drives the outputs in the table of lines itself, and asks each object with a device of its own
+//! ([`Object::make_safe`]). A shutdown value that cannot be written at once is *pending*: a worker has to write it, or the
+//! write failed. A failed write is retried every [`RETRY_TICKS`]. The program watches [`Mcu::pending_value`]. The
+//! guardian takes over if a value stays pending.
 //!
-//! The guardian cannot write some outputs ([`Object::is_guarded`]). Their debt ends after [`UNGUARDED_LIMIT`], because
-//! ending the program for it would help nobody. The MCU still retries them until the next configuration.
+//! The guardian cannot write some outputs ([`Object::is_guarded`]). The MCU waits for these no longer than
+//! [`UNGUARDED_LIMIT`], because the end of the program would help nobody. It still retries them until the next
+//! configuration.
 
 #![forbid(unsafe_code)]
 
@@ -24,12 +27,12 @@ pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 /// guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// The shutdown values that are still owed.
+/// The pending shutdown values.
 #[derive(Default)]
 pub(super) struct PendingValues {
     /// Whether `shut_down` is running. A failure meanwhile must not start it again.
     under_way: bool,
-    owed: Vec<Debt>,
+    values: Vec<PendingValue>,
 }
 
 /// Owner of a pending shutdown value.
@@ -41,8 +44,8 @@ pub(super) enum Subject {
     Output(usize),
 }
 
-/// A shutdown value that is still owed.
-struct Debt {
+/// A pending shutdown value.
+struct PendingValue {
     subject: Subject,
     /// The log's name for it.
     name: String,
@@ -59,7 +62,7 @@ impl PendingValues {
     /// Whether the MCU waits for any of them.
     #[inline]
     pub(super) fn are_awaited(&self) -> bool {
-        self.owed.iter().any(|debt| !debt.given_up)
+        self.values.iter().any(|value| !value.given_up)
     }
 }
 
@@ -85,8 +88,8 @@ impl State {
 
     /// Logs a failure of a stopped MCU. The shutdown value is retried later.
     pub(super) fn note_failure(&mut self, subject: Subject, kind: Option<&str>, shutdown: Shutdown) {
-        let known = self.pending.owed.iter_mut().find(|debt| debt.subject == subject);
-        let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
+        let known = self.pending.values.iter_mut().find(|value| value.subject == subject);
+        let again = known.is_some_and(|value| std::mem::replace(&mut value.failed, true));
         // It is retried twenty times a second, but logged once.
         if !again {
             let trouble = shutdown.of(&self.name_subject(subject, kind));
@@ -103,10 +106,10 @@ impl State {
 
     /// An output or the outputs of an object are at their shutdown values.
     pub(super) fn is_safe(&mut self, subject: Subject) {
-        let Some(place) = self.pending.owed.iter().position(|debt| debt.subject == subject) else { return };
-        let debt = self.pending.owed.swap_remove(place);
-        if debt.failed {
-            self.wire.note(Note::Safe(&debt.name));
+        let Some(place) = self.pending.values.iter().position(|value| value.subject == subject) else { return };
+        let value = self.pending.values.swap_remove(place);
+        if value.failed {
+            self.wire.note(Note::Safe(&value.name));
         }
     }
 
@@ -124,10 +127,10 @@ impl State {
 
     /// Notes the result of an attempt to reach a shutdown value.
     pub(super) fn note_safety(&mut self, subject: Subject, guarded: bool, safe: Result<Safe, Shutdown>) {
-        if !matches!(safe, Ok(Safe::Now)) && !self.pending.owed.iter().any(|debt| debt.subject == subject) {
+        if !matches!(safe, Ok(Safe::Now)) && !self.pending.values.iter().any(|value| value.subject == subject) {
             let name = self.name_subject(subject, None);
             let since = self.scheduler.last_read();
-            self.pending.owed.push(Debt { subject, name, failed: false, guarded, since, given_up: false });
+            self.pending.values.push(PendingValue { subject, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
             Ok(Safe::Now) => self.is_safe(subject),
@@ -139,7 +142,7 @@ impl State {
     /// Starts the timer of the next attempt. It is needed if a shutdown value could not be written, or if the MCU will
     /// stop waiting for one.
     fn retry_later(&mut self) {
-        if self.pending.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
+        if self.pending.values.iter().any(|value| value.failed || !value.guarded && !value.given_up) {
             self.scheduler.cancel(TimerId::RETRY);
             let at = self.scheduler.last_read() + RETRY_TICKS;
             self.scheduler.start(TimerId::RETRY, at);
@@ -150,20 +153,20 @@ impl State {
     /// cannot write.
     pub(super) fn retry(&mut self) {
         let now = self.scheduler.now();
-        for debt in self.pending.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
-            if now.since(debt.since) >= i64::from(UNGUARDED_LIMIT.0) {
-                debt.given_up = true;
+        for value in self.pending.values.iter_mut().filter(|value| !value.guarded && !value.given_up) {
+            if now.since(value.since) >= i64::from(UNGUARDED_LIMIT.0) {
+                value.given_up = true;
                 let cause = format!(
                     "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
-                    debt.name,
+                    value.name,
                     UNGUARDED_LIMIT.as_ms()
                 );
                 let stop = Shutdown::because(reason::BUS_HANGS, cause);
                 self.wire.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
             }
         }
-        for place in (0..self.pending.owed.len()).rev() {
-            let failed = self.pending.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.subject);
+        for place in (0..self.pending.values.len()).rev() {
+            let failed = self.pending.values.get(place).filter(|value| value.failed).map(|value| value.subject);
             if let Some(subject) = failed {
                 self.make_safe(subject);
             }
@@ -195,7 +198,7 @@ impl Mcu {
         let again = state.phase.stop(shutdown, clock);
         state.pending.under_way = true;
         if again.is_none() {
-            state.pending.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
+            state.pending.values.iter_mut().for_each(|value| (value.since, value.given_up) = (clock, false));
         }
         state.scheduler.clear();
         for oid in state.objects.oids() {
@@ -223,14 +226,14 @@ impl Mcu {
         }
     }
 
-    /// The log's name of an object that owes its shutdown value; `None` if nothing is owed.
-    pub fn debtor(&self) -> Option<&str> {
-        self.state.pending.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
+    /// The log's name of an object whose shutdown value is pending; `None` without one.
+    pub fn pending_value(&self) -> Option<&str> {
+        self.state.pending.values.iter().find(|value| !value.given_up).map(|value| value.name.as_str())
     }
 
-    /// Whether any shutdown value is owed.
+    /// Whether any shutdown value is pending.
     #[inline]
-    pub fn owes(&self) -> bool {
+    pub fn has_pending_values(&self) -> bool {
         self.state.pending.are_awaited()
     }
 

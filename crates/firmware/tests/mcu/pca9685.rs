@@ -101,7 +101,7 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
         let last = |register: u8| told.iter().rfind(|bytes| bytes[0] == register);
         assert_eq!(last(14), Some(&vec![14, 0, 0, 0, 0x10]));
         assert_eq!(last(66), Some(&vec![66, 0, 0x10, 0, 0]));
-        assert!(!rig.mcu.owes());
+        assert!(!rig.mcu.has_pending_values());
     }
 }
 
@@ -116,9 +116,9 @@ fn a_slow_chip_gets_the_newest_value_and_its_shutdown_value_last() {
     }
     rig.run_until(now + 40_000);
     rig.send("emergency_stop");
-    assert!(rig.mcu.owes());
+    assert!(rig.mcu.has_pending_values());
     rig.run_until(now + 200_000);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
     assert_eq!(bytes(&chip), [vec![66, 0, 0, 1, 0], vec![66, 0, 0x10, 0, 0]]);
 }
 
@@ -173,10 +173,10 @@ fn a_chip_that_goes_silent_stops_the_mcu_and_is_tried_until_it_answers() {
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
     rig.run_until(now + 20_000_000);
     assert_eq!(rig.shutdown().as_deref(), Some("Unable to update PCA9685 value"));
-    assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
+    assert_eq!(rig.mcu.pending_value(), Some("PCA9685"));
     let chip = plug(&rig);
     rig.run_until(now + 40_000_000);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
     assert_eq!(bytes(&chip), [[14, 0, 0, 0, 0x10], [66, 0, 0x10, 0, 0]]);
     rig.send("config_reset");
     rig.forget_responses();
@@ -219,11 +219,11 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     let now = rig.now();
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=2", now + 9000));
-    // The guardian takes over after a second without a heartbeat. There is no heartbeat while this value is owed.
+    // The guardian takes over after a second without a heartbeat. There is no heartbeat while this value is pending.
     rig.run_until(now + 24_000_000);
-    assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
+    assert_eq!(rig.mcu.pending_value(), Some("PCA9685"));
     rig.run_until(now + 30_000_000);
-    assert_eq!(rig.mcu.debtor(), None);
+    assert_eq!(rig.mcu.pending_value(), None);
     let notes = rig.notes();
     let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not taken its shutdown values for 500 ms"));
     assert_eq!(given_up.count(), 1, "{notes:?}");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Workers: each bus has a thread that runs the errands to the bus's devices, one after the other. So the core never
+//! Workers: each bus has a thread that runs the jobs to the bus's devices, one after the other. So the core never
 //! waits for a device.
 
 #![forbid(unsafe_code)]
@@ -26,7 +26,7 @@ use crate::core::busy_poll::PollBudget;
 use crate::core::heartbeat::{Heartbeat, JobClock};
 use crate::recorder::{Recording, span};
 
-/// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
+/// Highest number of jobs that may wait for one bus. There are at most 256 objects, with one or two jobs each.
 const QUEUE_JOBS: usize = 1024;
 /// How long a worker polls for the next job after a job that a command waited for. The core runs the next command
 /// within microseconds, if the host has sent it already.
@@ -68,8 +68,8 @@ pub(crate) struct Threads {
 }
 
 impl Threads {
-    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `heartbeat` since when it runs the
-    /// errand. It records its errands in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
+    /// No workers yet. A worker unparks `core` when a job is done, and notes in `heartbeat` since when it runs the
+    /// job. It records its jobs in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(crate) fn new(
         core: Thread,
         prepare: Prepare,
@@ -245,10 +245,10 @@ impl Server {
         let began = self.clock.now();
         let (number, holds) = (job.oid().number(), job.holds());
         self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
-        let ended = self.clock.errand(&mut || job.run(&mut self.devices));
+        let ended = self.clock.run_job(&mut || job.run(&mut self.devices));
         self.shown.end();
         self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
-        // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
+        // This does not fail: there are no more jobs under way than boxes, and both queues have the same length.
         let _ = self.done.push(FinishedJob { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
         if !(holds && self.jobs.peek().is_ok_and(|next| matches!(next, Message::Job(next, _) if next.holds()))) {
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
+    fn a_worker_polls_for_the_next_job_of_a_command_only() {
         // One look when the job is submitted, one when it begins, one when it ends, and one before the worker sleeps.
         assert_eq!(looks_after_a_job(false, true), 4);
         assert_eq!(looks_after_a_job(true, false), 4);
@@ -402,7 +402,7 @@ mod tests {
         // Another one takes its place.
         threads.start("i2c1").unwrap();
         drop(release);
-        // This ends when both errands are dropped. The second one is not begun.
+        // This ends when both jobs are dropped. The second one is not begun.
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
     }
 

@@ -11,18 +11,16 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-use log::warn;
 use pinion_sync::watch::Watch;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::between_ticks;
-use crate::mcu::{Context, Job};
+use crate::mcu::{Context, DeviceWarning, Job};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
-use super::Shifted;
+use super::{SUBJECT, Shifted};
 
 /// Shortest time that the clock is high, and low: 200 ns (T3 and T4 of the data sheet).
 const PULSE_NS: u32 = 200;
@@ -50,8 +48,10 @@ pub(super) struct Shift {
     announced: u32,
     /// The clock line's name in the log.
     name: String,
-    /// Whether the log already has a line about a clock that was high for too long.
+    /// Whether there was a warning about a clock that was high for too long.
     told: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Shift {
@@ -73,6 +73,7 @@ impl Shift {
             announced: 0,
             name: context.name(sclk_pin),
             told: false,
+            warning: None,
         }
     }
 
@@ -101,7 +102,7 @@ impl Shift {
         let too_long = longest > i64::from(self.time.at_most(POWER_DOWN_NS).0);
         if too_long && !self.told {
             self.told = true;
-            warn!("{}", too_slow(&self.name, longest));
+            self.warning = Some(DeviceWarning::new(SUBJECT, too_slow(&self.name, longest)));
         }
         Ok(Shifted { raw, too_long })
     }
@@ -130,12 +131,9 @@ impl Shift {
         Ok((raw, Some(longest)))
     }
 
-    /// Waits for the rest of a pulse, on the computer's clock. It may show a span that is too long by one of its steps.
+    /// Waits for the rest of a pulse.
     fn wait(&self) {
-        let (start, pulse) = (Instant::now(), Duration::from_nanos((PULSE_NS + self.time.step_ns()).into()));
-        while start.elapsed() < pulse {
-            std::hint::spin_loop();
-        }
+        self.time.spin_until(self.time.now() + self.time.at_least(PULSE_NS));
     }
 
     /// Announces the next pulse to the second worker. Returns when it watches this pulse, and for how many ticks the clock
@@ -158,7 +156,7 @@ impl Shift {
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
-        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
+        "{SUBJECT} ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
     )
 }
 
@@ -242,6 +240,7 @@ mod tests {
     use std::sync::Mutex;
     use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
     use std::thread;
+    use std::time::{Duration, Instant};
 
     /// A clock that is this many times slower than that of the computer. So other programs disturb the workers less.
     struct Slow(Instant, u32);
@@ -329,6 +328,7 @@ mod tests {
             announced: u32::MAX - 5,
             name: "gpio11".into(),
             told: false,
+            warning: None,
         };
         (shift, watcher, chip)
     }

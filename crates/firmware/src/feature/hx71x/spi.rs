@@ -19,13 +19,14 @@
 
 #![forbid(unsafe_code)]
 
-use log::warn;
-
 use crate::board::BusDevice;
 use crate::feature::spi::spi_shutdown;
 use crate::shutdown::Shutdown;
 
-use super::Shifted;
+use crate::mcu::DeviceWarning;
+use crate::trouble::Trouble;
+
+use super::{SUBJECT, Shifted};
 
 /// Bits per second.
 pub(super) const RATE_HZ: u32 = 500_000;
@@ -48,13 +49,15 @@ pub(super) struct Waves {
     name: String,
     /// Looks since the last sample.
     looks: u32,
-    /// Whether the log already has a line about a chip without samples.
+    /// Whether there was a warning about a chip without samples.
     told: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Waves {
     pub(super) fn new(device: Box<dyn BusDevice>, pulses: u8, name: String) -> Waves {
-        Waves { device, pulses, name, looks: 0, told: false }
+        Waves { device, pulses, name, looks: 0, told: false, warning: None }
     }
 
     /// Reads a sample, if one is ready.
@@ -65,10 +68,9 @@ impl Waves {
         if look[0] & 1 != 0 {
             self.looks = self.looks.saturating_add(1);
             if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.told, true) {
-                warn!(
-                    "HX71x sclk ({}): the chip has no sample: check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once",
-                    self.name
-                );
+                let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once");
+                let trouble = trouble.of(format_args!("{} ({})", SUBJECT, self.name));
+                self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
             }
             return Ok(None);
         }

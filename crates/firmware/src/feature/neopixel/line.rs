@@ -15,11 +15,10 @@
 
 use std::sync::Arc;
 
-use log::warn;
-
 use crate::board::{Line, Pin};
 use crate::feature::pace::Pace;
 use crate::mcu::Context;
+use crate::mcu::DeviceWarning;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
@@ -71,6 +70,9 @@ impl Limits {
     }
 }
 
+/// The first words of the warning.
+const WARNING: &str = "LEDs at";
+
 /// Sends frames.
 pub(super) struct Pulses {
     line: Arc<dyn Line>,
@@ -82,8 +84,10 @@ pub(super) struct Pulses {
     free_at: Clock,
     /// The line's name in the log.
     name: String,
-    /// Whether the log already has a line about frames that missed their times.
+    /// Whether there was a warning about frames that missed their times.
     told: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Pulses {
@@ -122,7 +126,7 @@ impl Pulses {
         }
         let pace = Pace::new(context);
         let free_at = pace.now() + reset;
-        Ok(Pulses { line, pace, limits, reset, free_at, name, told: false })
+        Ok(Pulses { line, pace, limits, reset, free_at, name, told: false, warning: None })
     }
 
     /// Sends the colors. False if no try had its times.
@@ -139,10 +143,11 @@ impl Pulses {
             }
         }
         if !std::mem::replace(&mut self.told, true) {
-            warn!(
-                "LEDs at {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
+            let text = format!(
+                "{WARNING} {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
                 self.name
             );
+            self.warning = Some(DeviceWarning::new(WARNING, text));
         }
         Ok(false)
     }
@@ -271,6 +276,7 @@ mod tests {
             free_at: Clock::EPOCH,
             name: "gpio18".into(),
             told: false,
+            warning: None,
         };
         (wire, pulses)
     }

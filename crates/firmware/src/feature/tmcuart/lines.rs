@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A TMC UART on GPIO lines, bit by bit.
 //!
-//! The firmware has a timer for each bit. Here an errand times a whole message on a worker. At 40 kbaud a message is up
+//! The firmware has a timer for each bit. Here a job times a whole message on a worker. At 40 kbaud a message is up
 //! to 5 ms of edges 25 us apart, which would keep the core awake. `benches/bits.rs` measures how late bits are
 //! in both cases (docs/develop/performance.md).
 //!
