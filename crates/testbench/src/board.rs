@@ -835,8 +835,8 @@ struct Shop {
     buses: Vec<Bus>,
     /// In the order of their end times.
     under_way: VecDeque<UnderWay>,
-    /// Jobs that hung when the workers were reset.
-    left_behind: Vec<UnderWay>,
+    /// Jobs that hung when the workers were reset, with the devices of their workers.
+    left_behind: Vec<(UnderWay, Option<Devices>)>,
 }
 
 /// A job on its way.
@@ -978,7 +978,7 @@ impl Workers for FakeWorkers {
         let now = self.bench.clock.now();
         let mut shop = self.shop.lock().unwrap();
         // A worker that hung returns and ends.
-        let back: Vec<UnderWay> = uncounted(|| shop.left_behind.extract_if(.., |hung| hung.end <= now).collect());
+        let back: Vec<_> = uncounted(|| shop.left_behind.extract_if(.., |(hung, _)| hung.end <= now).collect());
         drop(shop);
         uncounted(|| drop(back));
         self.next_end().is_some_and(|end| end <= now)
@@ -988,8 +988,12 @@ impl Workers for FakeWorkers {
     fn reset(&mut self) {
         let waits_until = self.bench.clock.now() + WORKERS_END;
         let mut shop = self.shop.lock().unwrap();
-        let Shop { under_way, mut left_behind, .. } = std::mem::replace(&mut *shop, Shop::new());
-        left_behind.extend(under_way.into_iter().filter(|work| work.begin <= waits_until && work.end > waits_until));
+        let Shop { under_way, mut left_behind, mut buses } = std::mem::replace(&mut *shop, Shop::new());
+        let hung = under_way.into_iter().filter(|work| work.begin <= waits_until && work.end > waits_until);
+        left_behind.extend(hung.map(|work| {
+            let devices = buses[work.worker].devices.take();
+            (work, devices)
+        }));
         shop.left_behind = left_behind;
     }
 }

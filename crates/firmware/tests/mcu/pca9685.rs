@@ -66,17 +66,18 @@ fn a_chip_is_set_up_once_and_its_outputs_get_their_values() {
     assert_eq!(bytes(&chip), set_up);
 }
 
+/// The chip's set-up takes 25,000 ticks, for its oscillator.
 #[test]
 fn queued_values_go_to_the_chip_at_their_instants() {
     let (mut rig, chip) = rig(0, &[OUTPUT, FREE]);
     bytes(&chip);
-    for (at, value) in [(1000, 4096), (50_000, 1), (90_000, 0)] {
+    for (at, value) in [(26_000, 4096), (50_000, 1), (90_000, 0)] {
         rig.send(&format!("queue_pca9685_out oid=0 clock=@{at} value={value}"));
     }
     rig.run_until(1_000_000);
     assert_eq!(
         heard(&chip),
-        [(1000, vec![14, 0, 0x10, 0, 0]), (50_000, vec![14, 0, 0, 1, 0]), (90_000, vec![14, 0, 0, 0, 0x10])]
+        [(26_000, vec![14, 0, 0x10, 0, 0]), (50_000, vec![14, 0, 0, 1, 0]), (90_000, vec![14, 0, 0, 0, 0x10])]
     );
     assert_eq!(rig.shutdown(), None, "its default value may stay");
 }
@@ -84,12 +85,12 @@ fn queued_values_go_to_the_chip_at_their_instants() {
 #[test]
 fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
     for (commands, text) in [
-        (&["queue_pca9685_out oid=0 clock=@1000 value=9"][..], "Missed scheduling of next pca9685 event"),
+        (&["queue_pca9685_out oid=0 clock=@26000 value=9"][..], "Missed scheduling of next pca9685 event"),
         (
-            &["queue_pca9685_out oid=0 clock=@1000 value=9", "queue_pca9685_out oid=0 clock=@101001 value=0"],
+            &["queue_pca9685_out oid=0 clock=@26000 value=9", "queue_pca9685_out oid=0 clock=@126001 value=0"],
             "Scheduled pca9685 event will exceed max_duration",
         ),
-        (&["queue_pca9685_out oid=0 clock=@1000 value=4097"], "Invalid pca9685 value"),
+        (&["queue_pca9685_out oid=0 clock=@26000 value=4097"], "Invalid pca9685 value"),
     ] {
         let (mut rig, chip) = rig(0, &[OUTPUT, FREE]);
         bytes(&chip);
@@ -193,8 +194,8 @@ fn a_value_that_is_not_acknowledged_is_written_again() {
         nacks -= 1;
         if nacks >= 0 { Err(BusStatus::Nack) } else { Ok(()) }
     });
-    rig.send("queue_pca9685_out oid=1 clock=@1000 value=1");
-    rig.run_until(2000);
+    rig.send("queue_pca9685_out oid=1 clock=@26000 value=1");
+    rig.run_until(27_000);
     assert_eq!(rig.shutdown(), None);
     assert_eq!(bytes(&chip), [[66, 0, 0, 1, 0]; 3]);
 }
