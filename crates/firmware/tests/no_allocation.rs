@@ -170,7 +170,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
         snapshot.clear();
         let mut parts = 1;
         print.counted += allocations(|| {
-            while !print.rig.mcu.tell(&mut snapshot) {
+            while !print.rig.mcu.fill(&mut snapshot) {
                 parts += 1;
             }
         });
@@ -183,7 +183,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
     // A status that contains the reason of the shutdown.
     print.rig.send("emergency_stop");
     snapshot.clear();
-    print.counted += allocations(|| while !print.rig.mcu.tell(&mut snapshot) {});
+    print.counted += allocations(|| while !print.rig.mcu.fill(&mut snapshot) {});
     assert!(snapshot.detail.starts_with("the host asked for it") && snapshot.stopped.is_some());
     assert_eq!(print.counted, 0);
 }

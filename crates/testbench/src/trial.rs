@@ -788,7 +788,7 @@ impl<'a> Trial<'a> {
     /// How many calls of its devices have failed.
     fn failures(&mut self) -> u64 {
         self.snapshot.clear();
-        while !self.rig.mcu.tell(&mut self.snapshot) {}
+        while !self.rig.mcu.fill(&mut self.snapshot) {}
         let Snapshot { lines, objects, .. } = &self.snapshot;
         let buses = lines.iter().filter_map(|line| line.bus).chain(objects.iter().filter_map(|object| object.bus));
         buses.map(|bus| u64::from(bus.errors)).sum()

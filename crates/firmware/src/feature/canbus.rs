@@ -39,11 +39,11 @@ fn states() -> Vec<Range> {
     CanState::ALL.map(range).into()
 }
 
-/// Calls `tell` with the node. A host on another wire does not know these commands.
-fn with_node(context: &mut Context, tell: impl FnOnce(&mut Context, &CanNode)) {
+/// Calls `f` with the node. A host on another wire does not know these commands.
+fn with_node(context: &mut Context, f: impl FnOnce(&mut Context, &CanNode)) {
     let dialect = context.heard().clone();
     if let Wire::Can(node) = dialect.wire() {
-        tell(context, node);
+        f(context, node);
     }
 }
 

@@ -195,12 +195,12 @@ impl Counter {
         }
         if self.next_sample < at {
             self.next_sample = at + self.sample_ticks;
-            self.tell(context, at);
+            self.send_state(context, at);
         }
     }
 
     /// Reports the count as it was at a given time.
-    fn tell(&mut self, context: &mut Context, at: Clock) {
+    fn send_state(&mut self, context: &mut Context, at: Clock) {
         let next_clock = at + self.poll_ticks;
         context.send(State { oid: context.oid(), next_clock, count: self.count, count_clock: self.count_clock });
     }
@@ -218,7 +218,7 @@ impl Counter {
                 self.count = count;
                 self.count_clock = last.unwrap_or(self.count_clock);
                 if counts {
-                    self.tell(context, ended);
+                    self.send_state(context, ended);
                 }
                 Ok(())
             }

@@ -63,7 +63,7 @@ const OWN_WORDS: Words = Words {
 };
 
 response! {
-    /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow to tell.
+    /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow for a time.
     "spi_angle_transfer_response oid=%c clock=%u response=%*s" => KNOWN;
     pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
 }

@@ -47,7 +47,7 @@ impl<'a> Context<'a> {
         self.state.wire.speaks::<R>()
     }
 
-    /// Whether the MCU behaves as hosts of these generations expect, where no form of a message tells them apart.
+    /// Whether the MCU behaves as hosts of these generations expect, where no form of a message differs.
     pub fn serves(&self, hosts: Generations) -> bool {
         self.state.wire.serves(hosts)
     }

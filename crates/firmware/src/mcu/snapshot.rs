@@ -58,7 +58,7 @@ pub struct Snapshot {
     /// How many lines and objects there were when the snapshot was begun.
     shape: (usize, usize),
     /// How many rows are filled in, plus one for the head.
-    told: usize,
+    filled: usize,
 }
 
 /// A GPIO line in use.
@@ -177,7 +177,7 @@ impl Default for Snapshot {
             objects: Vec::with_capacity(OBJECTS_MAX + ROWS),
             queues: Vec::with_capacity(QUEUES_MAX),
             shape: (0, 0),
-            told: 0,
+            filled: 0,
         }
     }
 }
@@ -185,7 +185,7 @@ impl Default for Snapshot {
 impl Snapshot {
     /// Call this before the snapshot is filled again.
     pub fn clear(&mut self) {
-        self.told = 0;
+        self.filled = 0;
     }
 }
 
@@ -219,16 +219,16 @@ impl fmt::Write for Room<'_> {
 impl Mcu {
     /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
     /// begins again if lines or objects came or went meanwhile. It does not allocate.
-    pub fn tell(&self, to: &mut Snapshot) -> bool {
+    pub fn fill(&self, to: &mut Snapshot) -> bool {
         let State { lines, objects, workers, .. } = &self.state;
         let shape = (lines.len(), objects.len());
-        if to.told == 0 || to.shape != shape {
+        if to.filled == 0 || to.shape != shape {
             to.shape = shape;
-            to.told = 1;
-            self.tell_head(to);
+            to.filled = 1;
+            self.fill_head(to);
             return false;
         }
-        let (first, rows) = (to.told - 1, shape.0 + shape.1);
+        let (first, rows) = (to.filled - 1, shape.0 + shape.1);
         let next = (first + ROWS).min(rows);
         for row in first..next {
             match row.checked_sub(shape.0) {
@@ -240,7 +240,7 @@ impl Mcu {
                 }
             }
         }
-        to.told = next + 1;
+        to.filled = next + 1;
         if next < rows {
             return false;
         }
@@ -253,7 +253,7 @@ impl Mcu {
         true
     }
 
-    fn tell_head(&self, to: &mut Snapshot) {
+    fn fill_head(&self, to: &mut Snapshot) {
         let State { phase, scheduler, wire, moves, .. } = &self.state;
         to.at = scheduler.last_read();
         to.is_configured = phase.is_finalized();

@@ -49,7 +49,7 @@ pub(super) struct Shift {
     /// The clock line's name in the log.
     name: String,
     /// Whether there was a warning about a clock that was high for too long.
-    told: bool,
+    has_warned: bool,
     /// A warning for the log.
     pub(super) warning: Option<DeviceWarning>,
 }
@@ -72,7 +72,7 @@ impl Shift {
             watch,
             announced: 0,
             name: context.name(sclk_pin),
-            told: false,
+            has_warned: false,
             warning: None,
         }
     }
@@ -100,8 +100,8 @@ impl Shift {
         let (raw, longest) = shifted?;
         let Some(longest) = longest else { return Ok(Shifted { raw, too_long: true }) };
         let too_long = longest > i64::from(self.time.at_most(POWER_DOWN_NS).0);
-        if too_long && !self.told {
-            self.told = true;
+        if too_long && !self.has_warned {
+            self.has_warned = true;
             self.warning = Some(DeviceWarning::new(SUBJECT, too_slow(&self.name, longest)));
         }
         Ok(Shifted { raw, too_long })
@@ -327,7 +327,7 @@ mod tests {
             watch: Some(watcher.watch.clone()),
             announced: u32::MAX - 5,
             name: "gpio11".into(),
-            told: false,
+            has_warned: false,
             warning: None,
         };
         (shift, watcher, chip)

@@ -50,14 +50,14 @@ pub(super) struct Waves {
     /// Looks since the last sample.
     looks: u32,
     /// Whether there was a warning about a chip without samples.
-    told: bool,
+    has_warned: bool,
     /// A warning for the log.
     pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Waves {
     pub(super) fn new(device: Box<dyn BusDevice>, pulses: u8, name: String) -> Waves {
-        Waves { device, pulses, name, looks: 0, told: false, warning: None }
+        Waves { device, pulses, name, looks: 0, has_warned: false, warning: None }
     }
 
     /// Reads a sample, if one is ready.
@@ -67,7 +67,7 @@ impl Waves {
         // The last bit is the newest.
         if look[0] & 1 != 0 {
             self.looks = self.looks.saturating_add(1);
-            if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.told, true) {
+            if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.has_warned, true) {
                 let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once");
                 let trouble = trouble.of(format_args!("{} ({})", SUBJECT, self.name));
                 self.warning = Some(DeviceWarning::new(SUBJECT, trouble));

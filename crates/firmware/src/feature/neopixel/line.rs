@@ -85,7 +85,7 @@ pub(super) struct Pulses {
     /// The line's name in the log.
     name: String,
     /// Whether there was a warning about frames that missed their times.
-    told: bool,
+    has_warned: bool,
     /// A warning for the log.
     pub(super) warning: Option<DeviceWarning>,
 }
@@ -126,7 +126,7 @@ impl Pulses {
         }
         let pace = Pace::new(context);
         let free_at = pace.now() + reset;
-        Ok(Pulses { line, pace, limits, reset, free_at, name, told: false, warning: None })
+        Ok(Pulses { line, pace, limits, reset, free_at, name, has_warned: false, warning: None })
     }
 
     /// Sends the colors. False if no try had its times.
@@ -142,7 +142,7 @@ impl Pulses {
                 return Ok(true);
             }
         }
-        if !std::mem::replace(&mut self.told, true) {
+        if !std::mem::replace(&mut self.has_warned, true) {
             let text = format!(
                 "{WARNING} {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
                 self.name
@@ -275,7 +275,7 @@ mod tests {
             reset: Ticks::from_us(300),
             free_at: Clock::EPOCH,
             name: "gpio18".into(),
-            told: false,
+            has_warned: false,
             warning: None,
         };
         (wire, pulses)
@@ -382,7 +382,7 @@ mod tests {
         let (wire, mut pulses) = pulses((0..200).map(|edge| (edge, When::After, 100)).collect());
         assert_eq!(pulses.send(&[0; 3]), Ok(false));
         assert_eq!(wire.edges.lock().unwrap().len(), 2 * TRIES as usize, "each is broken off after one pulse");
-        assert!(pulses.told);
+        assert!(pulses.has_warned);
         wire.late.lock().unwrap().clear();
         assert_eq!(pulses.send(&[0; 3]), Ok(true));
     }

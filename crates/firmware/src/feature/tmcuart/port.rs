@@ -3,7 +3,7 @@
 //!
 //! klippy's bits become bytes, and the bytes of the reply become bits again. With the usual cabling, RX is connected to
 //! the driver's only wire, and TX through a resistor. So the port also receives what it sends: the echo. It comes before
-//! the reply, and is taken off. With other cabling there is no echo. The received bytes themselves tell: an echo repeats
+//! the reply, and is taken off. With other cabling there is no echo. The received bytes themselves show it: an echo repeats
 //! the message from its first byte on. A reply cannot be taken for an echo. It begins with 05 FF, and FF is no driver's
 //! address.
 //!
@@ -54,7 +54,7 @@ pub(super) struct Port {
     /// Whether the port received its own messages so far.
     echoes: bool,
     /// The faults that it has warned of, each with the driver's address.
-    told: Vec<(Heard, u8)>,
+    warned: Vec<(Heard, u8)>,
     /// Whether there was a warning that the port failed.
     failed: bool,
     /// A warning for the log.
@@ -66,7 +66,7 @@ impl Port {
     pub(super) fn new(device: Box<dyn SerialPort>, name: String, bit: Ticks) -> Port {
         let bits = u64::from(TURN_BITS + REPLY_BITS) + FRAME_BITS as u64;
         let limit = Duration::from_nanos(bits * u64::from(bit.0) * NS_PER_TICK) + LATE_MAX;
-        Port { device, name, limit, echoes: true, told: Vec::new(), failed: false, warning: None }
+        Port { device, name, limit, echoes: true, warned: Vec::new(), failed: false, warning: None }
     }
 
     /// Sends a message, and receives its reply.
@@ -74,7 +74,7 @@ impl Port {
         let (sent, len) = bytes_of(message.bits());
         let sent = &sent[..len];
         match self.converse(sent, message) {
-            Ok(heard) => self.tell(heard, sent.get(1).copied().unwrap_or_default()),
+            Ok(heard) => self.warn(heard, sent.get(1).copied().unwrap_or_default()),
             Err(trouble) => {
                 if !std::mem::replace(&mut self.failed, true) {
                     let trouble = trouble.of(format_args!("{SUBJECT} {}", self.name));
@@ -135,11 +135,11 @@ impl Port {
     }
 
     /// Warns of each fault once for each driver.
-    fn tell(&mut self, heard: Heard, address: u8) {
-        if heard == Heard::All || self.told.contains(&(heard, address)) {
+    fn warn(&mut self, heard: Heard, address: u8) {
+        if heard == Heard::All || self.warned.contains(&(heard, address)) {
             return;
         }
-        self.told.push((heard, address));
+        self.warned.push((heard, address));
         let text = match heard {
             Heard::All => return,
             Heard::Nothing => "it receives nothing, not even its own message: connect RX to the driver's UART pin, and TX to it through 1 kOhm, or free the port if another program reads it (pinion doctor); said once".to_owned(),
