@@ -322,19 +322,19 @@ impl State {
             return self.enter(pin, ClaimedLine { line, sleeps_on }, direction, level, output);
         };
         let claim = &mut self.lines.claims[place];
+        let is_driven = |output: Option<&Output>| output.is_some_and(Output::is_driven_at_stop);
         // An output of an object keeps its shutdown value when something else drives the same line.
-        let (direction, output) = match (direction, claim.shutdown_value(), &claim.output, output) {
-            (Direction::Output { level, .. }, Some(shutdown_value), Some(own), output)
-                if own.is_driven_at_stop() && !output.as_ref().is_some_and(Output::is_driven_at_stop) =>
-            {
-                (Direction::Output { level, shutdown_value }, claim.output.take())
-            }
-            (direction, _, _, output) => (direction, output),
+        let kept = claim.shutdown_value().filter(|_| is_driven(claim.output.as_ref()) && !is_driven(output.as_ref()));
+        let direction = match (direction, kept) {
+            (Direction::Output { level, .. }, Some(shutdown_value)) => Direction::Output { level, shutdown_value },
+            (direction, _) => direction,
         };
         claim.line.set_direction(direction)?;
         claim.direction = direction;
         claim.level.begin(direction);
-        claim.output = output.map(|output| output.taking_over(claim.output.take()));
+        if kept.is_none() || claim.shutdown_value().is_none() {
+            claim.output = output.map(|output| output.taking_over(claim.output.take()));
+        }
         Ok(place)
     }
 
