@@ -17,7 +17,7 @@ use pinion_firmware::board::{
 };
 use pinion_firmware::lateness::Lateness;
 use pinion_firmware::mcu::{
-    Devices, Dialect, DialectName, FinishedJob, Generation, Mcu, Note, Outbox, Refused, SentJob, WorkerId, Workers,
+    Devices, Dialect, DialectName, Finished, Generation, Mcu, Note, Outbox, SentJob, WorkerId, Workers,
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
@@ -266,9 +266,9 @@ struct Threads {
     are_parallel: bool,
     /// By the names of their buses.
     workers: Vec<(String, Sender<Message>, usize)>,
-    outbox: Sender<FinishedJob>,
-    done: Mutex<Receiver<FinishedJob>>,
-    waiting: Mutex<Option<FinishedJob>>,
+    outbox: Sender<Finished>,
+    done: Mutex<Receiver<Finished>>,
+    waiting: Mutex<Option<Finished>>,
 }
 
 impl Threads {
@@ -304,7 +304,7 @@ impl Workers for Threads {
                 };
                 let began = clock.now();
                 job.run(&mut devices);
-                let _ = outbox.send(FinishedJob { job, began, ended: clock.now() });
+                let _ = outbox.send(Finished { job, began, ended: clock.now() });
             }
         });
         self.workers.push((bus.into(), jobs, 0));
@@ -319,10 +319,10 @@ impl Workers for Threads {
     fn are_parallel(&self) -> bool {
         self.are_parallel
     }
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         self.workers[worker].1.send(Message::Job(job)).map_err(|error| panic!("the worker ended: {error}"))
     }
-    fn completion(&mut self) -> Option<FinishedJob> {
+    fn completion(&mut self) -> Option<Finished> {
         self.waiting.lock().unwrap().take()
     }
     fn has_completion(&self) -> bool {

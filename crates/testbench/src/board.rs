@@ -11,7 +11,7 @@ use pinion_firmware::board::{
     self, Adc, Bank, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges,
     I2cConfig, Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
-use pinion_firmware::mcu::{Devices, FinishedJob, Refused, SentJob, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, Finished, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
@@ -859,7 +859,7 @@ struct Bus {
 
 enum Work {
     ToDo(SentJob),
-    Done(FinishedJob),
+    Done(Finished),
 }
 
 impl Shop {
@@ -921,9 +921,9 @@ impl Workers for FakeWorkers {
         Ok(bus.device_count - 1)
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: SentJob) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         if self.bench.state().refuses {
-            return Err(Refused { job, why: Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it") });
+            return Err((job, Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it")));
         }
         let takes = Ticks(self.bench.state().answer_ticks);
         let at_once = self.bench.state().byte_ticks != 0;
@@ -935,7 +935,7 @@ impl Workers for FakeWorkers {
             self.bench.state().bus_now = Some(end);
             job.run(bus.devices.as_mut().expect("no job runs"));
             end = self.bench.state().bus_now.take().unwrap_or(end);
-            Work::Done(FinishedJob { job, began: begin, ended: end })
+            Work::Done(Finished { job, began: begin, ended: end })
         } else {
             Work::ToDo(job)
         };
@@ -946,7 +946,7 @@ impl Workers for FakeWorkers {
 
     /// A job calls its device at its own end, unless bytes take time. A job that keeps time itself goes on from
     /// there in a time of its own. It is finished when that time has come.
-    fn completion(&mut self) -> Option<FinishedJob> {
+    fn completion(&mut self) -> Option<Finished> {
         while self.has_completion() {
             let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
             let mut job = match work {
@@ -964,11 +964,11 @@ impl Workers for FakeWorkers {
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {
-                return Some(FinishedJob { job, began, ended });
+                return Some(Finished { job, began, ended });
             }
             let mut shop = self.shop.lock().unwrap();
             shop.delay(worker, ended, Ticks(ended.since(end) as u32));
-            let work = Work::Done(FinishedJob { job, began, ended });
+            let work = Work::Done(Finished { job, began, ended });
             shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
         None

@@ -4,7 +4,7 @@
 //! `i2c_transfer` answers with the status of the bus, and klippy decides what to do. The older `i2c_read`, `i2c_write`
 //! and `i2c_modify_bits` have no status: a failure stops the MCU. A transfer is finished and answered before the next
 //! command runs, because klippy configures chips with one transfer after the other. A plain read is retried
-//! ([`BusDevice::read_register`]). A transfer that writes is not.
+//! ([`BusDevice::read_register`](crate::board::BusDevice::read_register)). A transfer that writes is not.
 
 #![forbid(unsafe_code)]
 

@@ -59,12 +59,15 @@ pub(super) struct Transfer {
     len: usize,
     /// Whether the bytes that come back are read.
     reads: bool,
+    /// Its round, if others may follow it at once, and the number of the round.
+    round: Option<(Round, u32)>,
 }
 
 impl Transfer {
-    const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true };
-
     /// An empty transfer, for a later load.
+    const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true, round: None };
+
+    /// A slot with an empty transfer.
     pub(super) fn slot(number: u8) -> JobSlot<Transfer> {
         JobSlot::numbered(number, Transfer::EMPTY)
     }
@@ -94,14 +97,21 @@ impl Job for Transfer {
 
     fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         let bytes = &mut self.bytes[..self.len];
-        if self.reads { chip.exchange(bytes) } else { chip.send(bytes) }
+        if self.reads {
+            return chip.exchange(bytes).inspect_err(|_| Round::end_of(&self.round));
+        }
+        // A transfer that reads is never skipped, because the host waits for its answer.
+        match &self.round {
+            Some((round, number)) if *number != round.number() => Ok(()),
+            round => chip.send(bytes).inspect_err(|_| Round::end_of(round)),
+        }
     }
 }
 
-/// Highest number of messages of one device under way. With this many, the core wakes up only for one of several.
+/// Highest number of transfers of one device under way. With this many, the core wakes up only for one of several.
 const UNDER_WAY_MAX: usize = 8;
 
-/// Numbers the messages that may be sent together. A failure or a stop takes the next number. Messages that still wait
+/// Numbers the transfers that may be sent together. A failure or a stop takes the next number. Transfers that still wait
 /// are then not sent.
 #[derive(Clone, Default)]
 struct Round(Arc<AtomicU32>);
@@ -114,27 +124,12 @@ impl Round {
     fn end(&self) {
         self.0.fetch_add(1, Ordering::AcqRel);
     }
-}
 
-/// A transfer that belongs to a round.
-struct Message {
-    transfer: Transfer,
-    round: Round,
-    /// The number of its round.
-    number: u32,
-}
-
-impl Job for Message {
-    type Device = Chip;
-    type Out = ();
-    type Failure = BusError;
-
-    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
-        // A transfer that reads is not skipped, because the host waits for its answer.
-        if self.number != self.round.number() && !self.transfer.reads {
-            return Ok(());
+    /// Ends the round of a transfer that failed.
+    fn end_of(round: &Option<(Round, u32)>) {
+        if let Some((round, _)) = round {
+            round.end();
         }
-        self.transfer.run(chip).inspect_err(|_| self.round.end())
     }
 }
 
@@ -142,7 +137,7 @@ impl Job for Message {
 pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
-    messages: [JobSlot<Message>; UNDER_WAY_MAX],
+    transfers: [JobSlot<Transfer>; UNDER_WAY_MAX],
     /// The next of them. They return in the order in which they were sent.
     next: usize,
     round: Round,
@@ -151,10 +146,11 @@ pub(super) struct Spi {
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
         let round = Round::default();
-        let messages = std::array::from_fn(|number| {
-            JobSlot::numbered(number as u8, Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
+        let transfers = std::array::from_fn(|number| {
+            let round = Some((round.clone(), 0));
+            JobSlot::numbered(number as u8, Transfer { round, ..Transfer::EMPTY })
         });
-        Spi { bus: None, chip_select, messages, next: 0, round }
+        Spi { bus: None, chip_select, transfers, next: 0, round }
     }
 
     /// Whether the device has a chip select line of its own.
@@ -211,16 +207,18 @@ impl Spi {
             }
             return Ok(());
         };
-        let slot = &mut self.messages[self.next];
+        let slot = &mut self.transfers[self.next];
         // It is here, unless a bus has been hanging since before a stop.
-        let Some(message) = slot.here() else {
+        let Some(transfer) = slot.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
-        message.number = self.round.number();
+        if let Some((round, number)) = &mut transfer.round {
+            *number = round.number();
+        }
         if answers {
-            message.transfer.load(data)
+            transfer.load(data)
         } else {
-            message.transfer.load_to_send(data)
+            transfer.load_to_send(data)
         }
         slot.send(context, bus.chip())?;
         self.next = (self.next + 1) % UNDER_WAY_MAX;
@@ -249,11 +247,11 @@ impl Object for Spi {
 
     fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
         let kind = self.kind();
-        let message = &mut self.messages[usize::from(number)];
-        if let Some(Back { result: Err(error), .. }) = message.back(finished) {
+        let slot = &mut self.transfers[usize::from(number)];
+        if let Some(Back { result: Err(error), .. }) = slot.back(finished) {
             return context.device_failed(kind, spi_shutdown(error.clone()));
         }
-        if let Some(Message { transfer, .. }) = message.here().filter(|message| message.transfer.reads) {
+        if let Some(transfer) = slot.here().filter(|transfer| transfer.reads) {
             context.send(TransferResponse { oid: context.oid(), response: transfer.bytes() });
         }
         Ok(())

@@ -123,7 +123,7 @@ pub struct SentJob {
     /// The object that sent it.
     oid: Oid,
     receiver: Receiver,
-    job: Box<dyn AnyJob>,
+    pub(super) job: Box<dyn AnyJob>,
     holds: bool,
 }
 
@@ -149,29 +149,14 @@ impl SentJob {
     }
 }
 
-/// A job that a worker cannot accept, and the reason.
-pub struct Refused {
-    /// The job, for its sender.
-    pub job: SentJob,
-    /// "Bus worker queue overflow".
-    pub why: Shutdown,
-}
-
-/// A job that is done, on its way back from its worker.
-pub struct FinishedJob {
+/// A job that is done, on its way back from its worker to its slot ([`JobSlot::back`]).
+pub struct Finished {
     /// The job and its result.
     pub job: SentJob,
     /// When the worker began the work.
     pub began: Clock,
     /// When the worker finished the work.
     pub ended: Clock,
-}
-
-/// A finished job for its slot ([`JobSlot::back`]).
-pub struct Finished {
-    pub(super) job: Box<dyn AnyJob>,
-    pub(super) began: Clock,
-    pub(super) ended: Clock,
 }
 
 /// A worker, by the number that [`Workers::start`] gave it.
@@ -208,11 +193,11 @@ pub trait Workers: Send {
     ///
     /// # Errors
     ///
-    /// The job, if the worker cannot accept it.
-    fn submit(&mut self, worker: WorkerId, job: SentJob) -> Result<(), Refused>;
+    /// The job, if the worker cannot accept it, and "Bus worker queue overflow".
+    fn submit(&mut self, worker: WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)>;
 
     /// The next finished job. The jobs of one bus finish in the order in which they were sent.
-    fn completion(&mut self) -> Option<FinishedJob>;
+    fn completion(&mut self) -> Option<Finished>;
 
     /// Whether [`Workers::completion`] has one.
     fn has_completion(&self) -> bool;
@@ -277,9 +262,9 @@ impl Context<'_> {
     ) -> Result<(), (Box<dyn AnyJob>, Shutdown)> {
         job.place = device.place;
         let sent = SentJob { oid: self.oid(), receiver, job, holds: hold.0 };
-        self.state.workers.submit(device.worker, sent).map_err(|Refused { job: SentJob { job, .. }, why }| {
+        self.state.workers.submit(device.worker, sent).map_err(|(sent, why)| {
             self.release(hold);
-            (job, why)
+            (sent.job, why)
         })
     }
 }
@@ -300,12 +285,12 @@ impl Mcu {
         self.reset_if_due();
     }
 
-    fn take_back(&mut self, FinishedJob { job: sent, began, ended }: FinishedJob) {
-        let SentJob { oid, receiver, mut job, holds } = sent;
+    fn take_back(&mut self, mut finished: Finished) {
+        let SentJob { oid, receiver, holds, job } = &mut finished.job;
+        let (oid, receiver, holds) = (*oid, *receiver, *holds);
         if let Some(warning) = job.take_warning() {
             self.state.wire.note(Note::Device(&warning));
         }
-        let finished = Finished { job, began, ended };
         let state = &mut self.state;
         state.barrier.take_back(holds);
         let done = match receiver {

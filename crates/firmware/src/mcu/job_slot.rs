@@ -10,7 +10,7 @@ use std::any::Any;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::job::{AnyJob, Boxed, Receiver};
+use super::job::{AnyJob, Boxed, Receiver, SentJob};
 use super::{Context, DeviceId, Finished, Hold, Job};
 
 /// The place of a job, here or with a worker.
@@ -104,7 +104,7 @@ impl<J: Job> JobSlot<J> {
 
     /// Takes the finished job back. `None` if it is the job of an earlier slot with this number.
     pub fn back(&mut self, finished: Finished) -> Option<Back<'_, J>> {
-        let Finished { job, began, ended } = finished;
+        let Finished { job: SentJob { job, .. }, began, ended } = finished;
         if self.is_here() {
             return None;
         }

@@ -50,7 +50,7 @@ pub use context::Context;
 pub use dialect::{Dialect, Firmware};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
 pub use inputs::{InputLine, Look};
-pub use job::{AnyJob, DeviceId, Devices, Finished, FinishedJob, Job, Refused, SentJob, WorkerId, Workers};
+pub use job::{AnyJob, DeviceId, Devices, Finished, Job, SentJob, WorkerId, Workers};
 pub use job_slot::{Back, JobSlot};
 pub use lines::EdgeRecorder;
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};

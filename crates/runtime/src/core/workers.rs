@@ -13,7 +13,7 @@ use std::time::Duration;
 use log::error;
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
-use pinion_firmware::mcu::{Devices, FinishedJob, Refused, SentJob, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, Finished, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -38,7 +38,7 @@ struct Worker {
     bus: String,
     jobs: Producer<Message>,
     devices: usize,
-    done: Consumer<FinishedJob>,
+    done: Consumer<Finished>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
     /// Nobody waits for its end.
@@ -155,20 +155,20 @@ impl Workers for Threads {
         }
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         let Some(worker) = self.workers.get_mut(worker) else {
-            return Err(Refused { job, why: no_worker() });
+            return Err((job, no_worker()));
         };
         if let Err(PushError::Full(Message::Job(job, _))) = worker.jobs.push(Message::Job(job, self.clock.now())) {
             let trouble = Trouble::new("more is asked of it at once than there are devices");
             let why = overflow(&worker.bus, trouble.remedy(REPORT));
-            return Err(Refused { job, why });
+            return Err((job, why));
         }
         worker.thread.thread().unpark();
         Ok(())
     }
 
-    fn completion(&mut self) -> Option<FinishedJob> {
+    fn completion(&mut self) -> Option<Finished> {
         self.workers.iter_mut().find_map(|worker| worker.done.pop().ok())
     }
 
@@ -211,7 +211,7 @@ impl Drop for Threads {
 struct Server {
     jobs: Consumer<Message>,
     devices: Devices,
-    done: Producer<FinishedJob>,
+    done: Producer<Finished>,
     quit: Arc<AtomicBool>,
     core: Thread,
     clock: Arc<dyn TimeSource>,
@@ -249,7 +249,7 @@ impl Server {
         self.shown.end();
         self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
         // This does not fail: there are no more jobs under way than boxes, and both queues have the same length.
-        let _ = self.done.push(FinishedJob { job, began, ended });
+        let _ = self.done.push(Finished { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
         if !(holds && self.jobs.peek().is_ok_and(|next| matches!(next, Message::Job(next, _) if next.holds()))) {
             self.core.unpark();
