@@ -147,7 +147,7 @@ fn a_print_allocates_nothing_once_configured() {
         rig.bench.state().counted.insert(13);
         rig.configure(OBJECTS);
         let print = print(rig);
-        assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
+        assert_eq!(print.rig.notes().len(), 2, "a counter is polled; configured; and nothing else");
         assert_eq!(print.counted, 0);
         assert_eq!(print.rig.bench.state().stores.is_empty(), !has_bank);
     }
