@@ -5,6 +5,7 @@
 //!
 //! A line is a word of memory here, as registers would be. Another thread watches the line of the LEDs.
 
+use std::any::Any;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::sync::{Arc, Mutex};
@@ -16,7 +17,7 @@ use pinion_firmware::board::{
 };
 use pinion_firmware::lateness::Lateness;
 use pinion_firmware::mcu::{
-    Completion, Dialect, DialectName, Generation, Job, Mcu, Note, Outbox, Refused, WorkerId, Workers,
+    Devices, Dialect, DialectName, Finished, Generation, Mcu, Note, Outbox, SentJob, WorkerId, Workers,
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
@@ -264,10 +265,10 @@ struct Threads {
     clock: Arc<dyn TimeSource>,
     are_parallel: bool,
     /// By the names of their buses.
-    workers: Vec<(String, Sender<Job>)>,
-    outbox: Sender<Completion>,
-    done: Mutex<Receiver<Completion>>,
-    waiting: Mutex<Option<Completion>>,
+    workers: Vec<(String, Sender<Message>, usize)>,
+    outbox: Sender<Finished>,
+    done: Mutex<Receiver<Finished>>,
+    waiting: Mutex<Option<Finished>>,
 }
 
 impl Threads {
@@ -277,31 +278,51 @@ impl Threads {
     }
 }
 
+/// To a worker.
+enum Message {
+    Device(Box<dyn Any + Send>),
+    Job(SentJob),
+}
+
 impl Workers for Threads {
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
-        if let Some(worker) = self.workers.iter().position(|(name, _)| name == bus) {
+        if let Some(worker) = self.workers.iter().position(|(name, ..)| name == bus) {
             return Ok(WorkerId(worker));
         }
-        let (jobs, inbox) = mpsc::channel::<Job>();
+        let (jobs, inbox) = mpsc::channel::<Message>();
         let (clock, outbox) = (self.clock.clone(), self.outbox.clone());
         thread::spawn(move || {
             realtime::enter(Role::Worker);
-            for Job { oid, mut parcel, holds } in inbox {
+            let mut devices = Devices::default();
+            for message in inbox {
+                let mut job = match message {
+                    Message::Device(device) => {
+                        devices.add(device);
+                        continue;
+                    }
+                    Message::Job(job) => job,
+                };
                 let began = clock.now();
-                parcel.run();
-                let _ = outbox.send(Completion { oid, parcel, holds, began, ended: clock.now() });
+                job.run(&mut devices);
+                let _ = outbox.send(Finished { job, began, ended: clock.now() });
             }
         });
-        self.workers.push((bus.into(), jobs));
+        self.workers.push((bus.into(), jobs, 0));
         Ok(WorkerId(self.workers.len() - 1))
+    }
+    fn give(&mut self, WorkerId(worker): WorkerId, device: Box<dyn Any + Send>) -> Result<usize, Shutdown> {
+        let (_, jobs, devices) = &mut self.workers[worker];
+        let _ = jobs.send(Message::Device(device));
+        *devices += 1;
+        Ok(*devices - 1)
     }
     fn are_parallel(&self) -> bool {
         self.are_parallel
     }
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
-        self.workers[worker].1.send(job).map_err(|error| panic!("the worker ended: {error}"))
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)> {
+        self.workers[worker].1.send(Message::Job(job)).map_err(|error| panic!("the worker ended: {error}"))
     }
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<Finished> {
         self.waiting.lock().unwrap().take()
     }
     fn has_completion(&self) -> bool {

@@ -175,7 +175,7 @@ fn status(c: &mut Criterion) {
     c.bench_function("status, eight steppers", |b| {
         b.iter(|| {
             snapshot.clear();
-            while !rig.mcu.tell(black_box(&mut snapshot)) {}
+            while !rig.mcu.fill(black_box(&mut snapshot)) {}
         })
     });
     const ROUNDS: u32 = 200;
@@ -192,7 +192,7 @@ fn status(c: &mut Criterion) {
         for edge in 0..8000 {
             if asked && edge % 4000 == 0 {
                 snapshot.clear();
-                while !rig.mcu.tell(black_box(&mut snapshot)) {}
+                while !rig.mcu.fill(black_box(&mut snapshot)) {}
             }
             rig.mcu.run_timers();
             if let Some(next) = rig.mcu.next_timer() {

@@ -272,7 +272,7 @@ impl Day {
         printer.pass(200 * MS);
         // An output that cannot be set is owed as long as its chip is gone.
         let is_owed = matches!(fault, ExpanderGone | PwmGone);
-        assert_eq!(printer.rig.mcu.owes(), is_owed, "{:?}", printer.rig.mcu.debtor());
+        assert_eq!(printer.rig.mcu.has_pending_values(), is_owed, "{:?}", printer.rig.mcu.pending_value());
         printer.faults.mend();
         self.check_stopped();
         let printer = &mut self.printer;
@@ -284,7 +284,7 @@ impl Day {
     fn check_stopped(&mut self) {
         let printer = &mut self.printer;
         printer.pass(100 * MS);
-        assert!(!printer.rig.mcu.owes(), "{:?} is owed", printer.rig.mcu.debtor());
+        assert!(!printer.rig.mcu.has_pending_values(), "{:?} is owed", printer.rig.mcu.pending_value());
         let positions = printer.positions();
         printer.pass(AFTER_STOP);
         assert_eq!(printer.positions(), positions, "a stopped MCU makes steps");
@@ -294,7 +294,7 @@ impl Day {
         assert!(!printer.probe.output("light").unwrap().on, "the light is on in a stopped MCU");
         assert!(printer.probe.sights().any(|sight| sight == ("laser", Look::Power { share: 0.0 })), "the laser is on");
         // The MCU still samples the thermistors.
-        assert!(printer.rig.errands() <= 2, "{} errands are on their way in a stopped MCU", printer.rig.errands());
+        assert!(printer.rig.jobs() <= 2, "{} jobs are on their way in a stopped MCU", printer.rig.jobs());
         assert_eq!(printer.look().moves.0, 0, "moves are queued in a stopped MCU");
     }
 

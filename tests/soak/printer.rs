@@ -236,7 +236,7 @@ impl Printer {
     /// Fills the snapshot.
     pub fn look(&mut self) -> &Snapshot {
         self.snapshot.clear();
-        while !self.rig.mcu.tell(&mut self.snapshot) {}
+        while !self.rig.mcu.fill(&mut self.snapshot) {}
         &self.snapshot
     }
 }

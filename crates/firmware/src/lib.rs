@@ -38,9 +38,9 @@
 //!         pub struct Echoed { number: u32, clock: Clock }
 //!     }
 //!
-//!     const ECHO: Command = command!("echo number=%u", |mcu, number: u32| {
-//!         let clock = mcu.now();
-//!         mcu.send(Echoed { number, clock });
+//!     const ECHO: Command = command!("echo number=%u", |context, number: u32| {
+//!         let clock = context.now();
+//!         context.send(Echoed { number, clock });
 //!         Ok(())
 //!     });
 //! }

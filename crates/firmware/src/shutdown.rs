@@ -110,7 +110,7 @@ pub mod reason {
         pub DEBUG_MEMORY = "Memory access is not available on Linux";
         /// A worker's queue is full: the host asks more of the bus than it can do (Pinion's own text).
         pub WORKER_OVERFLOW = "Bus worker queue overflow";
-        /// A bus conversation that a command began does not end (Pinion's own text).
+        /// A job that a command began does not end (Pinion's own text).
         pub BUS_HANGS = "Bus does not answer";
         /// No host can come any more: the program's input has ended (Pinion's own text).
         pub HOST_LOST = "Lost communication with host";

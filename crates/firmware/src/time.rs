@@ -55,9 +55,9 @@ pub trait TimeSource: Send + Sync {
     /// The time now; never earlier than a time that it returned before.
     fn now(&self) -> Clock;
 
-    /// Runs the work of an errand on this thread, and returns when the work ended. A clock other than the real one
+    /// Runs the work of a job on this thread, and returns when the work ended. A clock other than the real one
     /// gives the work a time of its own.
-    fn errand(&self, work: &mut dyn FnMut()) -> Clock {
+    fn run_job(&self, work: &mut dyn FnMut()) -> Clock {
         work();
         self.now()
     }
@@ -108,7 +108,7 @@ pub trait TimeSource: Send + Sync {
 /// The clock and the time limits of an MCU.
 #[derive(Clone)]
 pub struct Timing {
-    /// The clock of the core and of the workers' errands.
+    /// The clock of the core and of the workers' jobs.
     pub clock: Arc<dyn TimeSource>,
     /// The due time of the running timer, which the MCU stores here.
     pub due: Due,
@@ -189,7 +189,7 @@ impl TimeSource for VirtualClock {
     }
 
     /// The work has its own time, which begins now, as on another thread. The clock itself does not advance.
-    fn errand(&self, work: &mut dyn FnMut()) -> Clock {
+    fn run_job(&self, work: &mut dyn FnMut()) -> Clock {
         let now = self.now();
         work();
         Clock::from_ticks(self.0.swap(now.ticks(), Ordering::SeqCst))

@@ -147,7 +147,7 @@ fn a_print_allocates_nothing_once_configured() {
         rig.bench.state().counted.insert(13);
         rig.configure(OBJECTS);
         let print = print(rig);
-        assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
+        assert_eq!(print.rig.notes().len(), 2, "a counter is polled; configured; and nothing else");
         assert_eq!(print.counted, 0);
         assert_eq!(print.rig.bench.state().stores.is_empty(), !has_bank);
     }
@@ -170,7 +170,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
         snapshot.clear();
         let mut parts = 1;
         print.counted += allocations(|| {
-            while !print.rig.mcu.tell(&mut snapshot) {
+            while !print.rig.mcu.fill(&mut snapshot) {
                 parts += 1;
             }
         });
@@ -183,7 +183,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
     // A status that contains the reason of the shutdown.
     print.rig.send("emergency_stop");
     snapshot.clear();
-    print.counted += allocations(|| while !print.rig.mcu.tell(&mut snapshot) {});
+    print.counted += allocations(|| while !print.rig.mcu.fill(&mut snapshot) {});
     assert!(snapshot.detail.starts_with("the host asked for it") && snapshot.stopped.is_some());
     assert_eq!(print.counted, 0);
 }

@@ -165,7 +165,7 @@ pub fn run(
     };
     let _status = StatusSocket::start(&options.sockets, link.terminal(), facts, shown.clone(), snapshot_reader);
     let (mut recorder, trace_writer) = Recorder::new(recording.clone()).map_err(no_room)?;
-    let board = if options.trace_edges { recorder.with_edges(board) } else { board };
+    let edges = if options.trace_edges { recorder.edges() } else { None };
     let trace_sockets = trace_socket_paths(&options.sockets);
     let trace_socket = status::open_socket(&trace_sockets, link.terminal(), |errors| {
         warn!("pinion trace --live will not be answered: {errors}");
@@ -179,6 +179,7 @@ pub fn run(
     let (clock, dialect) = (timing.clock.clone(), handshake.first_dialect());
     let core = CoreThread {
         board,
+        edges,
         timing,
         dialect,
         wake,

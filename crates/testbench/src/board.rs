@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A board that records what the MCU does to its pins. A test plays the devices.
 
+use std::any::Any;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -10,7 +11,7 @@ use pinion_firmware::board::{
     self, Adc, Bank, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges,
     I2cConfig, Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
-use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, Finished, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
@@ -52,7 +53,7 @@ pub const MESSAGE_MAX: usize = 512;
 /// Bytes and their number, kept without an allocation.
 type Message = ([u8; MESSAGE_MAX], usize);
 
-/// A conversation with an SPI chip.
+/// A transfer with an SPI chip.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Transfer {
     /// When it began, in ticks.
@@ -96,7 +97,7 @@ pub struct State {
     i2c_chips: HashMap<(u32, u8), I2cChip>,
     /// The last direction of each claimed pin.
     pub directions: HashMap<u32, Direction>,
-    /// The changes of direction during conversations, in order.
+    /// The changes of direction within messages, in order.
     pub turns: Vec<(u32, Direction)>,
     /// Inputs with edges that an interrupt counts.
     pub counted: HashSet<u32>,
@@ -104,7 +105,7 @@ pub struct State {
     pub sleeping: HashSet<u32>,
     /// Lines that are written and read without a call of the kernel.
     pub fast: HashSet<u32>,
-    /// Whether an errand is running. Only then may lines that sleep be called.
+    /// Whether a job is running. Only then may lines that sleep be called.
     on_worker: bool,
     /// ADC and PWM channels in use.
     pub claimed: HashSet<u32>,
@@ -143,12 +144,12 @@ pub struct State {
     pub link: Option<SleepyLink>,
     /// How long a device on a worker takes to answer; 0 by default.
     pub answer_ticks: u32,
-    /// Whether the workers' queues are full and refuse errands.
+    /// Whether the workers' queues are full and refuse jobs.
     pub refuses: bool,
-    /// How long each byte takes on a bus. If it is not 0, an errand runs as soon as it is submitted. Its chip gets the
+    /// How long each byte takes on a bus. If it is not 0, a job runs as soon as it is submitted. Its chip gets the
     /// times at which its transfers will begin.
     pub byte_ticks: u32,
-    /// The time that the running errand has reached, if [`State::byte_ticks`] is not 0.
+    /// The time that the running job has reached, if [`State::byte_ticks`] is not 0.
     bus_now: Option<Clock>,
 }
 
@@ -186,7 +187,7 @@ pub struct Bench {
     state: Arc<Mutex<State>>,
     gate: Arc<Gate>,
     clock: VirtualClock,
-    /// How many ticks ago the worker ran the present errand. The core may have stood still since then.
+    /// How many ticks ago the worker ran the present job. The core may have stood still since then.
     ago: Arc<AtomicU32>,
     /// A test's times count from here.
     origin: Clock,
@@ -195,7 +196,7 @@ pub struct Bench {
 /// Lets the SPI chips hang, in tests in real time.
 #[derive(Default)]
 struct Gate {
-    /// Whether it is closed, and whether a conversation waits at it.
+    /// Whether it is closed, and whether a transfer waits at it.
     state: Mutex<(bool, bool)>,
     changed: Condvar,
 }
@@ -216,7 +217,7 @@ impl Bench {
         self.gate.changed.notify_all();
     }
 
-    /// Whether a conversation hangs.
+    /// Whether a transfer hangs.
     pub fn hangs(&self) -> bool {
         self.gate.state.lock().unwrap().1
     }
@@ -262,7 +263,7 @@ impl Bench {
         self.clock.set(self.clock.now() + ticks);
     }
 
-    /// When a conversation of `bytes` bytes begins.
+    /// When a transfer of `bytes` bytes begins.
     fn bus_ticks(&self, bytes: usize) -> u64 {
         let mut state = self.state();
         let takes = Ticks(state.byte_ticks * bytes as u32);
@@ -823,7 +824,7 @@ impl BusDevice for FakeSpi {
     }
 }
 
-/// Workers in virtual time. The errands of one bus run one after the other, and each takes its time.
+/// Workers in virtual time. The jobs of one bus run one after the other, and each takes its time.
 #[derive(Clone)]
 pub struct FakeWorkers {
     bench: Bench,
@@ -831,15 +832,14 @@ pub struct FakeWorkers {
 }
 
 struct Shop {
-    /// Each bus, and when it is free again.
-    buses: Vec<(String, Clock)>,
+    buses: Vec<Bus>,
     /// In the order of their end times.
     under_way: VecDeque<UnderWay>,
-    /// Errands that hung when the workers were reset.
-    left_behind: Vec<UnderWay>,
+    /// Jobs that hung when the workers were reset, with the devices of their workers.
+    left_behind: Vec<(UnderWay, Option<Devices>)>,
 }
 
-/// An errand on its way.
+/// A job on its way.
 struct UnderWay {
     worker: usize,
     begin: Clock,
@@ -847,13 +847,23 @@ struct UnderWay {
     work: Work,
 }
 
+/// A bus and its worker.
+struct Bus {
+    name: String,
+    /// When it is free again.
+    free: Clock,
+    /// `None` while a job runs.
+    devices: Option<Devices>,
+    device_count: usize,
+}
+
 enum Work {
-    ToDo(Job),
-    Done(Completion),
+    ToDo(SentJob),
+    Done(Finished),
 }
 
 impl Shop {
-    /// Reserves memory for more errands than a test sends, because the bench must not allocate later.
+    /// Reserves memory for more jobs than a test sends, because the bench must not allocate later.
     fn new() -> Shop {
         Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256), left_behind: Vec::new() }
     }
@@ -863,13 +873,14 @@ impl Shop {
         uncounted(|| self.under_way.insert(place, new));
     }
 
-    /// Delays the errands after one that ran for a time of its own on this worker.
+    /// Delays the jobs after one that ran for a time of its own on this worker.
     fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
-        self.buses[worker].1 = self.buses[worker].1.max(ended);
+        let free = &mut self.buses[worker].free;
+        *free = (*free).max(ended);
         for other in self.under_way.iter_mut().filter(|other| other.worker == worker) {
             other.begin = other.begin + by;
             other.end = other.end + by;
-            self.buses[worker].1 = self.buses[worker].1.max(other.end);
+            *free = (*free).max(other.end);
         }
         uncounted(|| self.under_way.make_contiguous().sort_by_key(|other| other.end));
     }
@@ -881,12 +892,12 @@ impl FakeWorkers {
         FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
     }
 
-    /// How many errands are on their way.
+    /// How many jobs are on their way.
     pub fn under_way(&self) -> usize {
         self.shop.lock().unwrap().under_way.len()
     }
 
-    /// When the next errand ends.
+    /// When the next job ends.
     pub fn next_end(&self) -> Option<Clock> {
         self.shop.lock().unwrap().under_way.front().map(|next| next.end)
     }
@@ -895,59 +906,69 @@ impl FakeWorkers {
 impl Workers for FakeWorkers {
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         let mut shop = self.shop.lock().unwrap();
-        let known = shop.buses.iter().position(|(name, _)| name == bus);
+        let known = shop.buses.iter().position(|known| known.name == bus);
         Ok(WorkerId(known.unwrap_or_else(|| {
-            shop.buses.push((bus.into(), Clock::EPOCH));
+            let devices = Some(Devices::default());
+            shop.buses.push(Bus { name: bus.into(), free: Clock::EPOCH, devices, device_count: 0 });
             shop.buses.len() - 1
         })))
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Refused> {
+    fn give(&mut self, WorkerId(worker): WorkerId, device: Box<dyn Any + Send>) -> Result<usize, Shutdown> {
+        let bus = &mut self.shop.lock().unwrap().buses[worker];
+        bus.devices.as_mut().expect("no job runs").add(device);
+        bus.device_count += 1;
+        Ok(bus.device_count - 1)
+    }
+
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         if self.bench.state().refuses {
-            return Err(Refused { job, why: Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it") });
+            return Err((job, Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it")));
         }
         let takes = Ticks(self.bench.state().answer_ticks);
         let at_once = self.bench.state().byte_ticks != 0;
         let mut shop = self.shop.lock().unwrap();
-        let free = &mut shop.buses[worker].1;
-        let begin = self.bench.clock.now().max(*free);
+        let bus = &mut shop.buses[worker];
+        let begin = self.bench.clock.now().max(bus.free);
         let mut end = begin + takes;
         let work = if at_once {
             self.bench.state().bus_now = Some(end);
-            job.parcel.run();
+            job.run(bus.devices.as_mut().expect("no job runs"));
             end = self.bench.state().bus_now.take().unwrap_or(end);
-            let Job { oid, parcel, holds } = job;
-            Work::Done(Completion { oid, parcel, holds, began: begin, ended: end })
+            Work::Done(Finished { job, began: begin, ended: end })
         } else {
             Work::ToDo(job)
         };
-        *free = end;
+        bus.free = end;
         shop.insert(UnderWay { worker, begin, end, work });
         Ok(())
     }
 
-    /// An errand calls its device at its own end, unless bytes take time. An errand that keeps time itself goes on from
+    /// A job calls its device at its own end, unless bytes take time. A job that keeps time itself goes on from
     /// there in a time of its own. It is finished when that time has come.
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<Finished> {
         while self.has_completion() {
             let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
-            let Job { oid, mut parcel, holds } = match work {
+            let mut job = match work {
                 Work::ToDo(job) => job,
-                Work::Done(completion) => return Some(completion),
+                Work::Done(finished) => return Some(finished),
             };
             let ago = Ticks(self.bench.clock.now().since(end) as u32);
             self.bench.state().on_worker = true;
             self.bench.ago.store(ago.0, Ordering::Relaxed);
             // A worker may take memory, for example for the words of what failed.
-            let ended = uncounted(|| self.bench.clock.errand(&mut || parcel.run())) - ago;
+            let taken = || self.shop.lock().unwrap().buses[worker].devices.take();
+            let mut devices = taken().expect("no other job runs");
+            let ended = uncounted(|| self.bench.clock.run_job(&mut || job.run(&mut devices))) - ago;
+            self.shop.lock().unwrap().buses[worker].devices = Some(devices);
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {
-                return Some(Completion { oid, parcel, holds, began, ended });
+                return Some(Finished { job, began, ended });
             }
             let mut shop = self.shop.lock().unwrap();
             shop.delay(worker, ended, Ticks(ended.since(end) as u32));
-            let work = Work::Done(Completion { oid, parcel, holds, began, ended });
+            let work = Work::Done(Finished { job, began, ended });
             shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
         None
@@ -957,7 +978,7 @@ impl Workers for FakeWorkers {
         let now = self.bench.clock.now();
         let mut shop = self.shop.lock().unwrap();
         // A worker that hung returns and ends.
-        let back: Vec<UnderWay> = uncounted(|| shop.left_behind.extract_if(.., |hung| hung.end <= now).collect());
+        let back: Vec<_> = uncounted(|| shop.left_behind.extract_if(.., |(hung, _)| hung.end <= now).collect());
         drop(shop);
         uncounted(|| drop(back));
         self.next_end().is_some_and(|end| end <= now)
@@ -967,8 +988,12 @@ impl Workers for FakeWorkers {
     fn reset(&mut self) {
         let waits_until = self.bench.clock.now() + WORKERS_END;
         let mut shop = self.shop.lock().unwrap();
-        let Shop { under_way, mut left_behind, .. } = std::mem::replace(&mut *shop, Shop::new());
-        left_behind.extend(under_way.into_iter().filter(|work| work.begin <= waits_until && work.end > waits_until));
+        let Shop { under_way, mut left_behind, mut buses } = std::mem::replace(&mut *shop, Shop::new());
+        let hung = under_way.into_iter().filter(|work| work.begin <= waits_until && work.end > waits_until);
+        left_behind.extend(hung.map(|work| {
+            let devices = buses[work.worker].devices.take();
+            (work, devices)
+        }));
         shop.left_behind = left_behind;
     }
 }

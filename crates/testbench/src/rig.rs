@@ -43,6 +43,7 @@ impl Outbox for FakeOutbox {
         let text = match note {
             Note::Shutdown(shutdown) => format!("shutdown: {shutdown}"),
             Note::Warning(shutdown) => format!("warning: {shutdown}"),
+            Note::Device(warning) => format!("warning: {}", warning.trouble),
             Note::Trouble(shutdown) => format!("trouble: {shutdown}"),
             Note::Configured(kinds) => format!("configured: {kinds:?}"),
             Note::Safe(name) => format!("safe: {name}"),
@@ -161,8 +162,8 @@ impl Rig {
         self.clock.now().wire()
     }
 
-    /// How many errands are on their way.
-    pub fn errands(&self) -> usize {
+    /// How many jobs are on their way.
+    pub fn jobs(&self) -> usize {
         self.workers.under_way()
     }
 
@@ -252,13 +253,13 @@ impl Rig {
         commands.iter().for_each(|command| self.send(command));
     }
 
-    /// Runs one command, and does not wait for the end of its conversation.
+    /// Runs one command, and does not wait for the end of its job.
     pub fn begin(&mut self, command: &str) {
         let payload = self.encode(command);
         self.mcu.execute(&mut Reader::new(&payload));
     }
 
-    /// Runs the commands of a block's payload. It waits for the end of each command's conversation, unless the next
+    /// Runs the commands of a block's payload. It waits for the end of each command's job, unless the next
     /// command joins it.
     #[inline]
     pub fn execute(&mut self, payload: &[u8]) {

@@ -8,7 +8,7 @@
 //!
 //! - Nothing panics. Every response has the form of the dictionary.
 //! - A stopped MCU has its outputs at their shutdown values, and makes no steps.
-//! - Commands are held for no longer than the limit. A number of errands and moves is never exceeded.
+//! - Commands are held for no longer than the limit. A number of jobs and moves is never exceeded.
 //! - A configured MCU that works as it should allocates nothing.
 //! - Whatever happened, a reset and a configuration make it work again.
 
@@ -53,7 +53,7 @@ const PINS: &[u32] = &[
     EXPANDED, EXPANDED + 1, EXPANDED + 2, EXPANDED + 3, ANALOG, ANALOG + 1, ANALOG + 2, PWM, PWM + 1, MOSI, MOSI + 1,
     SPI_CHIPS, SPI_CHIPS + 1, 300, 255, u32::MAX,
 ];
-/// Spans that a worker waits for between two edges. They are short here: the bench runs an errand to its end at once
+/// Spans that a worker waits for between two edges. They are short here: the bench runs a job to its end at once
 /// and cannot interrupt it, as a stop does.
 const PACED: &[&str] = &["delay_ticks", "sync_delay_ticks", "cmd_delay_ticks", "pulse_ticks", "bit_time"];
 const PACED_TICKS: u32 = 500;
@@ -69,9 +69,9 @@ const SERIAL: &[u8] = b"28";
 const OIDS: u8 = 100;
 /// Number of objects for each command that creates one.
 const OBJECTS_OF_A_KIND: usize = 2;
-/// Highest number of errands on their way. No object has more than 32 boxes for them, except PCA9685, which has one for
+/// Highest number of jobs on their way. No object has more than 32 boxes for them, except PCA9685, which has one for
 /// each output.
-const ERRANDS_MAX: usize = 1024;
+const JOBS_MAX: usize = 1024;
 /// Highest number of parameters that a command has.
 const PARAMETERS_MAX: usize = 9;
 /// Highest number of actions in a trial.
@@ -393,7 +393,7 @@ fn pass_until(rig: &mut Rig, ticks: u64, turns: u32) -> u64 {
     })
 }
 
-/// Runs a command to the end of its conversation. Returns how often the MCU allocated or freed memory.
+/// Runs a command to the end of its job. Returns how often the MCU allocated or freed memory.
 fn run(rig: &mut Rig, payload: &[u8]) -> u64 {
     let (mut reader, mut allocations) = (Reader::new(payload), 0);
     while !reader.is_empty() {
@@ -436,8 +436,8 @@ fn try_out(rig: &mut Rig, form: &Form, values: &[Value]) -> Option<String> {
 fn settle(rig: &mut Rig) {
     let limit = rig.now() + u64::from(CLOCK_FREQ);
     pass(rig, |rig| {
-        assert!(rig.now() < limit, "{:?} is not at its shutdown value", rig.mcu.debtor());
-        rig.mcu.owes()
+        assert!(rig.now() < limit, "{:?} is not at its shutdown value", rig.mcu.pending_value());
+        rig.mcu.has_pending_values()
     });
 }
 
@@ -674,10 +674,10 @@ impl<'a> Trial<'a> {
         self.mend();
         let now = self.rig.now();
         say(&mut self.rig, "emergency_stop");
-        let debtor = self.rig.mcu.debtor().map(str::to_owned);
+        let pending = self.rig.mcu.pending_value().map(str::to_owned);
         say(&mut self.rig, "config_reset");
         let took = self.rig.now() - now;
-        assert!(took < u64::from(CLOCK_FREQ), "a reset takes {took} ticks, for {debtor:?}");
+        assert!(took < u64::from(CLOCK_FREQ), "a reset takes {took} ticks, for {pending:?}");
         self.named.clear();
         self.outputs.clear();
         self.step_pins.clear();
@@ -746,7 +746,8 @@ impl<'a> Trial<'a> {
 
     fn act(&mut self, action: &Action) {
         // What fails is explained in words, which take memory, and so is a stop. `buttons_add` claims a pin.
-        let is_sound = |rig: &Rig| rig.mcu.is_running() && !rig.mcu.owes() && rig.bench.state().broken.is_empty();
+        let is_sound =
+            |rig: &Rig| rig.mcu.is_running() && !rig.mcu.has_pending_values() && rig.bench.state().broken.is_empty();
         let mut is_frugal = is_sound(&self.rig);
         self.allocated = 0;
         if !matches!(action, Action::Send(..)) {
@@ -787,7 +788,7 @@ impl<'a> Trial<'a> {
     /// How many calls of its devices have failed.
     fn failures(&mut self) -> u64 {
         self.snapshot.clear();
-        while !self.rig.mcu.tell(&mut self.snapshot) {}
+        while !self.rig.mcu.fill(&mut self.snapshot) {}
         let Snapshot { lines, objects, .. } = &self.snapshot;
         let buses = lines.iter().filter_map(|line| line.bus).chain(objects.iter().filter_map(|object| object.bus));
         buses.map(|bus| u64::from(bus.errors)).sum()
@@ -821,7 +822,7 @@ impl<'a> Trial<'a> {
         });
         self.rig.notes();
         self.rig.bench.forget();
-        assert!(self.rig.errands() <= ERRANDS_MAX, "{} errands are under way", self.rig.errands());
+        assert!(self.rig.jobs() <= JOBS_MAX, "{} jobs are under way", self.rig.jobs());
         let (moves, moves_max) = self.snapshot.moves;
         assert!(moves <= moves_max, "{moves} of {moves_max} moves are queued");
     }

@@ -122,7 +122,7 @@ pub trait Line: Send + Sync {
     /// an output pin" and "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
 
-    /// The same during a conversation on this line (single-wire UART, open-drain I2C). It is as fast as a write,
+    /// The same within a message on this line (single-wire UART, open-drain I2C). It is as fast as a write,
     /// because the guardian is not informed. Claim the line as an input, so that the guardian never drives it.
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.set_direction(direction)
@@ -280,7 +280,7 @@ pub enum BusStatus {
     StartReadNack,
 }
 
-/// Why a conversation with a chip failed.
+/// Why a transfer with a chip failed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BusError {
     /// How the bus answered, for the wire.
@@ -289,9 +289,9 @@ pub struct BusError {
     pub trouble: Trouble,
 }
 
-/// One addressed chip on its bus. A worker uses it, one conversation at a time.
+/// One addressed chip on its bus. A worker uses it, one job at a time.
 ///
-/// A chip is on an SPI or an I2C bus. Conversations of the other kind fail.
+/// A chip is on an SPI or an I2C bus. Transfers of the other kind fail.
 pub trait BusDevice: Send {
     /// Sends the bytes and replaces each by the received byte (SPI). Without bytes, the chip is only
     /// [selected for a moment](ChipSelect::pulse).

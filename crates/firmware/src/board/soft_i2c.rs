@@ -14,7 +14,7 @@ use super::{BusDevice, BusError, BusStatus, Line};
 use crate::time::{Ticks, TimeSource};
 use crate::trouble::Trouble;
 
-/// How long a chip may hold the clock low in one conversation: 100 ms, as in the kernel's driver
+/// How long a chip may hold the clock low in one message: 100 ms, as in the kernel's driver
 /// (drivers/i2c/busses/i2c-gpio.c).
 const STRETCH_MAX: Ticks = Ticks::from_ms(100);
 /// The last bit of an address byte, set for a read.
@@ -108,7 +108,7 @@ impl SoftI2c {
         Ok(byte)
     }
 
-    /// A start, or a repeated start within a conversation: SDA falls while the clock is high.
+    /// A start, or a repeated start within a message: SDA falls while the clock is high.
     fn start(&mut self) -> Result<(), BusError> {
         self.pause();
         self.sda.write(true)?;
@@ -414,7 +414,7 @@ mod tests {
             distinct
         });
         assert!(distinct.windows(2).all(|pair| pair[1] - pair[0] >= 250), "{distinct:?}");
-        // This conversation takes at least 29 bits of two halves each.
+        // This message takes at least 29 bits of two halves each.
         assert!(distinct.last().unwrap() - distinct.first().unwrap() >= 29 * 2 * 250);
     }
 

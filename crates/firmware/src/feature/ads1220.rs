@@ -8,8 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Oid, Slot, Turn,
-    command, since,
+    Command, Context, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, JobSlot, Oid, command, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
@@ -37,10 +36,10 @@ struct Ads1220 {
 
 impl ReadyChip for Ads1220 {
     const NAME: &'static str = "ADS1220";
-    type Reading = Conversation<Frame<SAMPLE_BYTES>>;
+    type Reading = Frame<SAMPLE_BYTES>;
 
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
-        reading.converse(turn, self.spi)
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.send_to(context, self.spi)
     }
 
     fn stop(failure: &BusError) -> Shutdown {
@@ -56,8 +55,8 @@ type Sensor = ReadyAdc<Ads1220>;
 
 const CONFIG_ADS1220: Command = command!(
     "config_ads1220 oid=%c spi_oid=%c data_ready_pin=%u",
-    |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin| {
-        configure_spi(mcu, oid, (spi_oid, data_ready_pin), Ads1220 { spi: spi_oid }, SAMPLE_BYTES)
+    |context, oid: Oid, spi_oid: Oid, data_ready_pin: Pin| {
+        configure_spi(context, oid, (spi_oid, data_ready_pin), Ads1220 { spi: spi_oid }, SAMPLE_BYTES)
     }
 )
 .of(since(V0_13));
@@ -65,25 +64,25 @@ const CONFIG_ADS1220: Command = command!(
 const ADS1220_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
-    |sensor, turn, trigger_analog_oid: Oid| { sensor.attached.attach(turn, trigger_analog_oid) }
+    |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
 .of(since(Master));
 
 const ADS1220_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads1220_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
-    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
+    |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
 const QUERY_ADS1220: Command =
-    command!("query_ads1220 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_ads1220 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(V0_13));
 
 const QUERY_ADS1220_STATUS: Command =
-    command!("query_ads1220_status oid=%c", Sensor, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
+    command!("query_ads1220_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

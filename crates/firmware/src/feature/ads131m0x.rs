@@ -8,8 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Oid, Slot, Turn, command,
-    since,
+    Command, Context, Enumeration, Feature, Generation::Kalico, Generation::Master, JobSlot, Oid, command, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
@@ -152,10 +151,10 @@ fn error_sample(code: u8) -> Sample {
 
 impl ReadyChip for Ads131m0x {
     const NAME: &'static str = "ADS131M0x";
-    type Reading = Conversation<Frame<FRAME_MAX>>;
+    type Reading = Frame<FRAME_MAX>;
 
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
-        reading.converse(turn, self.spi)
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.send_to(context, self.spi)
     }
 
     fn stop(failure: &BusError) -> Shutdown {
@@ -173,7 +172,7 @@ impl ReadyChip for Ads131m0x {
         }
     }
 
-    fn switch(&mut self, _turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, _context: &mut Context, on: bool) -> Result<(), Shutdown> {
         if on {
             self.was_reset = false;
         }
@@ -185,7 +184,7 @@ type Sensor = ReadyAdc<Ads131m0x>;
 
 const CONFIG_ADS131M0X: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c channel=%c num_channels=%c data_ready_pin=%u",
-    |mcu, oid: Oid, spi_oid: Oid, channel: u8, num_channels: u8, data_ready_pin: Pin| {
+    |context, oid: Oid, spi_oid: Oid, channel: u8, num_channels: u8, data_ready_pin: Pin| {
         if !(2..=CHANNELS_MAX as u8).contains(&num_channels) || channel >= num_channels {
             return Err(Shutdown::by_host(
                 INVALID_CHANNELS,
@@ -193,14 +192,14 @@ const CONFIG_ADS131M0X: Command = command!(
             ));
         }
         let chip = Ads131m0x { spi: spi_oid, channels: Channels::One(channel), was_reset: false };
-        configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(num_channels))
+        configure_spi(context, oid, (spi_oid, data_ready_pin), chip, frame_bytes(num_channels))
     }
 )
 .of(since(Master));
 
 const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c data_ready_pin=%u sensor_channel_count=%c channel_mask=%c",
-    |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin, sensor_channel_count: u8, channel_mask: u8| {
+    |context, oid: Oid, spi_oid: Oid, data_ready_pin: Pin, sensor_channel_count: u8, channel_mask: u8| {
         if !(1..=CHANNELS_MAX as u8).contains(&sensor_channel_count) {
             return Err(Shutdown::by_host(
                 INVALID_CHANNEL_COUNT,
@@ -214,7 +213,7 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
             ));
         }
         let chip = Ads131m0x { spi: spi_oid, channels: Channels::Mask(channel_mask), was_reset: false };
-        configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(sensor_channel_count))
+        configure_spi(context, oid, (spi_oid, data_ready_pin), chip, frame_bytes(sensor_channel_count))
     }
 )
 .of(since(Kalico));
@@ -222,25 +221,25 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
 const ADS131M0X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads131m0x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
-    |sensor, turn, trigger_analog_oid: Oid| sensor.attached.attach(turn, trigger_analog_oid)
+    |sensor, context, trigger_analog_oid: Oid| sensor.attached.attach(context, trigger_analog_oid)
 )
 .of(since(Master));
 
 const ADS131M0X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads131m0x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
-    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
+    |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
 const QUERY_ADS131M0X: Command =
-    command!("query_ads131m0x oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_ads131m0x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(Master).and(Kalico));
 
-const QUERY_ADS131M0X_STATUS: Command = command!("query_ads131m0x_status oid=%c", Sensor, |sensor, turn| sensor
-    .query_status(turn))
+const QUERY_ADS131M0X_STATUS: Command = command!("query_ads131m0x_status oid=%c", Sensor, |sensor, context| sensor
+    .query_status(context))
 .of(since(Master).and(Kalico));
 
 #[cfg(test)]

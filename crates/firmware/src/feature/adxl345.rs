@@ -114,25 +114,25 @@ impl FifoChip for Adxl345 {
 
 type Sensor = FifoSensor<Adxl345>;
 
-const CONFIG_ADXL345: Command = command!("config_adxl345 oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
-    configure(mcu, oid, spi_oid, Adxl345)
+const CONFIG_ADXL345: Command = command!("config_adxl345 oid=%c spi_oid=%c", |context, oid: Oid, spi_oid: Oid| {
+    configure(context, oid, spi_oid, Adxl345)
 });
 
 const QUERY_ADXL345_AT: Command = command!(
     "query_adxl345 oid=%c clock=%u rest_ticks=%u",
     Sensor,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(turn, clock, rest_ticks) }
+    |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
 .of(until(V0_12));
 
 const QUERY_ADXL345: Command =
-    command!("query_adxl345 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_adxl345 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(V0_13));
 
 const QUERY_ADXL345_STATUS: Command =
-    command!("query_adxl345_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn));
+    command!("query_adxl345_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context));
 
 #[cfg(test)]
 mod tests {

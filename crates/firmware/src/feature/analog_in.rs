@@ -8,9 +8,9 @@
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Back, BusCounts, Calls, Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Mcu, Next, Object, Oid, Present, Report, Response, Slot, Timer, Turn, Unread, WireClock,
-    WorkerId, command, response, since, until,
+    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, Feature, Finished, Generation::Kalico,
+    Generation::Master, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Present, Report, Response, Timer, Unread,
+    WireClock, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -50,18 +50,22 @@ const SAMPLE_BYTES: usize = 2;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// One reading of a channel.
-struct Reading {
+/// A channel, on the worker of its chip.
+struct Channel {
     adc: Box<dyn Adc>,
     calls: Calls,
 }
 
-impl Errand for Reading {
-    type Answer = u16;
+/// One reading of a channel.
+struct Read;
+
+impl Job for Read {
+    type Device = Channel;
+    type Out = u16;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<u16, Shutdown> {
-        self.calls.repeat(|| self.adc.read())
+    fn run(&mut self, channel: &mut Channel) -> Result<u16, Shutdown> {
+        channel.calls.repeat(|| channel.adc.read())
     }
 }
 
@@ -103,8 +107,8 @@ struct Query {
 }
 
 struct AnalogIn {
-    worker: WorkerId,
-    reading: Slot<Reading>,
+    channel: DeviceId<Channel>,
+    reading: JobSlot<Read>,
     calls: Calls,
     unread: Unread,
     /// Whether a sample waits until the ADC has finished a reading of an earlier query.
@@ -135,13 +139,13 @@ impl AnalogIn {
     }
 
     /// Makes the worker read the ADC. If a reading is still under way, the next one follows when it returns.
-    fn sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn sample(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if !self.reading.is_here() {
             self.waiting = true;
             return Ok(());
         }
-        self.unread.asked(turn.now());
-        self.reading.send(turn, self.worker)
+        self.unread.asked(context.now());
+        self.reading.send(context, self.channel)
     }
 
     /// Moves `next_begin` ahead by one `rest_ticks`, or by as many as it takes to reach the future. Sums that were due
@@ -159,9 +163,9 @@ impl AnalogIn {
         };
     }
 
-    fn check_range(&mut self, mcu: &Mcu) -> Result<(), Shutdown> {
+    fn check_range(&mut self, context: &Context) -> Result<(), Shutdown> {
         // Kalico ignores limits this way (`temp_ignore_limits`).
-        if self.query.range_check_count == 0 && mcu.serves(since(Kalico)) {
+        if self.query.range_check_count == 0 && context.serves(since(Kalico)) {
             return Ok(());
         }
         if (self.query.min_value..=self.query.max_value).contains(&self.sum) {
@@ -173,7 +177,7 @@ impl AnalogIn {
             return Ok(());
         }
         self.invalid_count = 0;
-        mcu.try_shut_down(Shutdown::because(
+        context.try_shut_down(Shutdown::because(
             ADC_RANGE,
             format!(
                 "it read {} where {} to {} is allowed (sum of {} samples): a heater past its limits, or a sensor that is broken or unplugged",
@@ -182,8 +186,8 @@ impl AnalogIn {
         ))
     }
 
-    fn query(&mut self, turn: &mut Turn, at: Clock, query: Query) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    fn query(&mut self, context: &mut Context, at: Clock, query: Query) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.restart();
         self.next_begin = at;
         self.query = query;
@@ -191,18 +195,22 @@ impl AnalogIn {
         if query.sample_count == 0 {
             return Ok(());
         }
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 
-    fn report(&mut self, turn: &mut Turn) {
+    fn report(&mut self, context: &mut Context) {
         let Some(bytes_per_report) = self.query.bytes_per_report else {
-            return turn.send(State { oid: turn.oid(), next_clock: self.next_begin, value: self.sum });
+            return context.send(State { oid: context.oid(), next_clock: self.next_begin, value: self.sum });
         };
         let bytes = self.sum.to_le_bytes();
         self.report[self.report_len..self.report_len + SAMPLE_BYTES].copy_from_slice(&bytes);
         self.report_len += SAMPLE_BYTES;
         if !bytes_per_report.has_room(self.report_len) {
-            turn.send(Batch { oid: turn.oid(), next_clock: self.next_begin, values: &self.report[..self.report_len] });
+            context.send(Batch {
+                oid: context.oid(),
+                next_clock: self.next_begin,
+                values: &self.report[..self.report_len],
+            });
             self.report_len = 0;
         }
     }
@@ -213,19 +221,19 @@ impl Object for AnalogIn {
         "analog input"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         self.sample_at = at;
-        self.sample(turn)?;
+        self.sample(context)?;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted, ended: read_at, .. }) = self.reading.back(finished) else { return Ok(()) };
         if result.is_ok() {
             self.unread.read();
         }
-        if !counts {
-            return if std::mem::take(&mut self.waiting) { self.sample(turn) } else { Ok(()) };
+        if !is_wanted {
+            return if std::mem::take(&mut self.waiting) { self.sample(context) } else { Ok(()) };
         }
         let sample = match result {
             Ok(sample) => sample,
@@ -233,29 +241,29 @@ impl Object for AnalogIn {
                 // A move may depend on an attached input.
                 let at_once = !matches!(self.attached, Attached::Nothing);
                 if at_once || self.unread.is_too_long(read_at) {
-                    turn.try_shut_down(failure.clone())?;
+                    context.try_shut_down(failure.clone())?;
                 }
                 // Drop this sum. The next one begins at its own time.
                 self.restart();
-                self.skip_missed(turn.now());
-                turn.go_on(TIMER, self.next_begin);
+                self.skip_missed(context.now());
+                context.go_on(TIMER, self.next_begin);
                 return Ok(());
             }
         };
         self.last = Some(sample);
         self.sum = self.sum.wrapping_add(sample);
         self.taken += 1;
-        let now = turn.now();
+        let now = context.now();
         if self.taken < self.query.sample_count {
-            turn.go_on(TIMER, (self.sample_at + self.query.sample_ticks).max(now));
+            context.go_on(TIMER, (self.sample_at + self.query.sample_ticks).max(now));
             return Ok(());
         }
-        self.check_range(turn)?;
+        self.check_range(context)?;
         self.skip_missed(now);
-        self.attached.update(turn, self.sum.into(), read_at)?;
-        self.report(turn);
+        self.attached.update(context, self.sum.into(), read_at)?;
+        self.report(context);
         self.restart();
-        turn.go_on(TIMER, self.next_begin);
+        context.go_on(TIMER, self.next_begin);
         Ok(())
     }
 
@@ -267,7 +275,7 @@ impl Object for AnalogIn {
         Some(self.calls.counts())
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
+    fn shutdown(&mut self, context: &mut Context) {
         // A reading under way no longer counts.
         self.restart();
         self.attached = Attached::default();
@@ -276,18 +284,18 @@ impl Object for AnalogIn {
             return;
         }
         // Sampling continues, as in the firmware, so that the host also sees the temperatures of a stopped MCU.
-        self.skip_missed(turn.now());
-        turn.go_on(TIMER, self.next_begin);
+        self.skip_missed(context.now());
+        context.go_on(TIMER, self.next_begin);
     }
 }
 
-const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
-    mcu.vacant(oid)?;
-    let OnWorker { bus, device: adc } = mcu.board()?.adc(pin)?;
-    let calls = Calls::new(mcu.clock());
+const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |context, oid: Oid, pin: Pin| {
+    context.vacant(oid)?;
+    let OnWorker { bus, device: adc } = context.board()?.adc(pin)?;
+    let calls = Calls::new(context.clock());
     let input = AnalogIn {
-        worker: mcu.worker(&bus)?,
-        reading: Slot::new(Reading { adc, calls: calls.clone() }),
+        channel: context.device(&bus, Box::new(Channel { adc, calls: calls.clone() }))?,
+        reading: JobSlot::new(Read),
         calls,
         unread: Unread::default(),
         waiting: false,
@@ -302,14 +310,14 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         report_len: 0,
         attached: Attached::default(),
     };
-    mcu.assign_on(pin, oid, input)
+    context.assign_on(pin, oid, input)
 });
 
 const QUERY_ANALOG_IN: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c",
     AnalogIn,
     |input,
-     turn,
+     context,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -317,11 +325,11 @@ const QUERY_ANALOG_IN: Command = command!(
      min_value: u16,
      max_value: u16,
      range_check_count: u8| {
-        let at = turn.instant(clock);
+        let at = context.instant(clock);
         let bytes_per_report = None;
         let query =
             Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
-        input.query(turn, at, query)
+        input.query(context, at, query)
     }
 )
 .of(until(V0_13).and(Kalico));
@@ -330,7 +338,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c",
     AnalogIn,
     |input,
-     turn,
+     context,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -339,7 +347,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
      min_value: u16,
      max_value: u16,
      range_check_count: u8| {
-        let at = turn.instant(clock);
+        let at = context.instant(clock);
         let bytes_per_report = Some(BytesPerReport::of(bytes_per_report)?);
         let query = Query {
             sample_ticks,
@@ -350,7 +358,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
             range_check_count,
             bytes_per_report,
         };
-        input.query(turn, at, query)
+        input.query(context, at, query)
     }
 )
 .of(since(Master));
@@ -358,6 +366,6 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     AnalogIn,
-    |input, turn, trigger_analog_oid: Oid| input.attached.attach(turn, trigger_analog_oid)
+    |input, context, trigger_analog_oid: Oid| input.attached.attach(context, trigger_analog_oid)
 )
 .of(since(Master));

@@ -65,19 +65,19 @@ impl FifoChip for Bmi160 {
 type Sensor = FifoSensor<Bmi160>;
 
 const CONFIG_BMI160: Command =
-    command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
-        configure(mcu, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
+    command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |context, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
+        configure(context, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
     })
     .of(since(Master));
 
 const QUERY_BMI160: Command =
-    command!("query_bmi160 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_bmi160 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(Master));
 
 const QUERY_BMI160_STATUS: Command =
-    command!("query_bmi160_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn)).of(since(Master));
+    command!("query_bmi160_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context)).of(since(Master));
 
 #[cfg(test)]
 mod tests {

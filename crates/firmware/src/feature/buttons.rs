@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response,
+    Command, Context, Feature, Finished, InputLine, Next, Object, Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -60,8 +60,16 @@ impl RetransmitCount {
     }
 }
 
+/// A button's line. A line that replaces another one has a new number. So a read of the earlier one does not count.
+struct Button {
+    number: u8,
+    line: InputLine,
+}
+
 struct Buttons {
-    buttons: Vec<Option<InputLine>>,
+    buttons: Vec<Option<Button>>,
+    /// The number of the next line's reads.
+    next_number: u8,
     rest_ticks: Ticks,
     /// The levels of the current sample.
     sample: u8,
@@ -84,6 +92,7 @@ impl Buttons {
     fn new(count: usize) -> Buttons {
         Buttons {
             buttons: (0..count).map(|_| None).collect(),
+            next_number: 0,
             rest_ticks: Ticks(0),
             sample: 0,
             unread: 0,
@@ -98,24 +107,26 @@ impl Buttons {
         }
     }
 
-    fn add(&mut self, mcu: &mut Mcu, place: u8, pin: Pin, pull_up: i8) -> Result<(), Shutdown> {
+    fn add(&mut self, context: &mut Context, place: u8, pin: Pin, pull_up: i8) -> Result<(), Shutdown> {
         let count = self.buttons.len();
         let Some(slot) = self.buttons.get_mut(usize::from(place)) else {
             let what = format_args!("button {place} is set of {count}");
             return Err(Shutdown::by_host(PAST_COUNT, what));
         };
-        *slot = Some(mcu.late_input(pin, bias(pull_up))?);
+        let number = self.next_number;
+        *slot = Some(Button { number, line: context.late_input(number, pin, bias(pull_up))? });
+        self.next_number = number.wrapping_add(1);
         self.counts = false;
         Ok(())
     }
 
     /// Reads each button. A button that was not added reads low.
-    fn take_sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn take_sample(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         (self.sample, self.unread) = (0, 0);
         self.counts = true;
         for (place, button) in self.buttons.iter_mut().enumerate() {
             let Some(button) = button else { continue };
-            if let Some(level) = button.read(turn)? {
+            if let Some(level) = button.line.read(context)? {
                 self.sample |= u8::from(level) << place;
             }
         }
@@ -141,21 +152,25 @@ impl Buttons {
 
     /// Whether workers of expanders are still reading the last sample.
     fn is_awaited(&self) -> bool {
-        self.buttons.iter().flatten().any(InputLine::is_looking)
+        self.buttons.iter().flatten().any(|button| button.line.is_looking())
     }
 
     /// Debounces a complete sample, and reports a new state.
-    fn sampled(&mut self, turn: &mut Turn) -> bool {
+    fn sampled(&mut self, context: &mut Context) -> bool {
         let news = !self.is_awaited() && std::mem::take(&mut self.counts) && self.debounce();
         if news {
-            self.report(turn);
+            self.report(context);
         }
         news
     }
 
-    fn report(&mut self, turn: &mut Turn) {
+    fn report(&mut self, context: &mut Context) {
         self.retransmit = Some(self.retransmit_count.0);
-        turn.send(State { oid: turn.oid(), ack_count: self.ack_count, state: &self.reports[..self.report_count] });
+        context.send(State {
+            oid: context.oid(),
+            ack_count: self.ack_count,
+            state: &self.reports[..self.report_count],
+        });
     }
 
     fn acknowledge(&mut self, count: u8) {
@@ -174,17 +189,17 @@ impl Object for Buttons {
         "buttons"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         // Expanders that are still being read for the last sample miss this one.
         let news = if self.is_awaited() {
-            self.buttons.iter().flatten().try_for_each(|button| button.awaited(turn))?;
+            self.buttons.iter().flatten().try_for_each(|button| button.line.awaited(context))?;
             false
         } else {
-            self.take_sample(turn)?;
-            self.sampled(turn)
+            self.take_sample(context)?;
+            self.sampled(context)
         };
         match self.retransmit {
-            Some(0) if !news => self.report(turn),
+            Some(0) if !news => self.report(context),
             Some(left) if !news => self.retransmit = Some(left - 1),
             _ => {}
         }
@@ -192,45 +207,48 @@ impl Object for Buttons {
     }
 
     /// A worker has read a line of an expander.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        // A line that was replaced in the meantime does not count: the new line has its own look.
-        for (place, button) in self.buttons.iter_mut().enumerate() {
-            let Some(look) = button.as_mut().and_then(|button| button.sampled(turn, done)) else { continue };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let mut buttons = self.buttons.iter_mut().enumerate();
+        let read = buttons.find_map(|(place, button)| Some((place, button.as_mut().filter(|b| b.number == number)?)));
+        if let Some((place, button)) = read
+            && let Some(look) = button.line.sampled(context, finished)
+        {
             match look?.level {
                 Some(level) => self.sample |= u8::from(level) << place,
                 None => self.unread |= 1 << place,
             }
         }
-        self.sampled(turn);
+        self.sampled(context);
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.counts = false;
     }
 }
 
-const CONFIG_BUTTONS: Command = command!("config_buttons oid=%c button_count=%c", |mcu, oid: Oid, button_count: u8| {
-    let count = usize::from(button_count);
-    if count > BUTTONS {
-        return Err(Shutdown::by_host(MAX_BUTTONS, format_args!("{count} buttons are asked for")));
-    }
-    mcu.assign(oid, Buttons::new(count))
-});
+const CONFIG_BUTTONS: Command =
+    command!("config_buttons oid=%c button_count=%c", |context, oid: Oid, button_count: u8| {
+        let count = usize::from(button_count);
+        if count > BUTTONS {
+            return Err(Shutdown::by_host(MAX_BUTTONS, format_args!("{count} buttons are asked for")));
+        }
+        context.assign(oid, Buttons::new(count))
+    });
 
 const BUTTONS_ADD: Command = command!(
     "buttons_add oid=%c pos=%c pin=%u pull_up=%c",
     Buttons,
-    |buttons, turn, pos: u8, pin: Pin, pull_up: i8| buttons.add(turn, pos, pin, pull_up)
+    |buttons, context, pos: u8, pin: Pin, pull_up: i8| buttons.add(context, pos, pin, pull_up)
 );
 
 const BUTTONS_QUERY: Command = command!(
     "buttons_query oid=%c clock=%u rest_ticks=%u retransmit_count=%c invert=%c",
     Buttons,
-    |buttons, turn, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
-        let at = turn.instant(clock);
+    |buttons, context, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
+        let at = context.instant(clock);
         let retransmit_count = RetransmitCount::of(retransmit_count)?;
-        turn.cancel(TIMER);
+        context.cancel(TIMER);
         buttons.rest_ticks = rest_ticks;
         buttons.retransmit_count = retransmit_count;
         buttons.pressed = invert;
@@ -242,7 +260,7 @@ const BUTTONS_QUERY: Command = command!(
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );
 

@@ -4,7 +4,9 @@
 #![forbid(unsafe_code)]
 
 use crate::board::Range;
-use crate::mcu::{CanHealth, CanNode, CanState, Command, Enumeration, Feature, Mcu, Response, Wire, command, response};
+use crate::mcu::{
+    CanHealth, CanNode, CanState, Command, Context, Enumeration, Feature, Response, Wire, command, response,
+};
 use crate::shutdown::shutdowns;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -37,26 +39,26 @@ fn states() -> Vec<Range> {
     CanState::ALL.map(range).into()
 }
 
-/// Calls `tell` with the node. A host on another wire does not know these commands.
-fn with_node(mcu: &mut Mcu, tell: impl FnOnce(&mut Mcu, &CanNode)) {
-    let dialect = mcu.heard().clone();
+/// Calls `f` with the node. A host on another wire does not know these commands.
+fn with_node(context: &mut Context, f: impl FnOnce(&mut Context, &CanNode)) {
+    let dialect = context.heard().clone();
     if let Wire::Can(node) = dialect.wire() {
-        tell(mcu, node);
+        f(context, node);
     }
 }
 
-const GET_CANBUS_ID: Command = command!("get_canbus_id", |mcu| {
-    with_node(mcu, |mcu, node| {
-        mcu.send(CanbusId { canbus_uuid: &node.uuid, canbus_nodeid: node.node_id().into() });
+const GET_CANBUS_ID: Command = command!("get_canbus_id", |context| {
+    with_node(context, |context, node| {
+        context.send(CanbusId { canbus_uuid: &node.uuid, canbus_nodeid: node.node_id().into() });
     });
     Ok(())
 })
 .allowed_in_shutdown();
 
-const GET_CANBUS_STATUS: Command = command!("get_canbus_status", |mcu| {
-    with_node(mcu, |mcu, node| {
+const GET_CANBUS_STATUS: Command = command!("get_canbus_status", |context| {
+    with_node(context, |context, node| {
         let CanHealth { rx_error, tx_error, tx_retries, state } = node.health();
-        mcu.send(CanbusStatus { rx_error, tx_error, tx_retries, canbus_bus_state: state as u32 });
+        context.send(CanbusStatus { rx_error, tx_error, tx_retries, canbus_bus_state: state as u32 });
     });
     Ok(())
 })

@@ -12,12 +12,10 @@
 
 use std::sync::Arc;
 
-use log::warn;
-
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, InputLine, Look, Next, Object, Oid, Response, Slot, Timer, Turn, WireClock,
-    WorkerId, command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, InputLine, Job, JobSlot, Look, Next, Object,
+    Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -93,9 +91,11 @@ impl Settling {
     }
 }
 
-/// Reads the edges that the kernel has timestamped, on a worker.
+/// The first word of each warning.
+const SUBJECT: &str = "counter";
+
+/// Reads the edges that the kernel has timestamped.
 struct Reading {
-    edges: Box<dyn Edges>,
     clock: Arc<dyn TimeSource>,
     /// The pin's name in the log.
     name: String,
@@ -108,17 +108,19 @@ struct Reading {
     interrupts: u32,
     /// Whether there were too many, so that the interrupts are switched off.
     given_up: bool,
+    warning: Option<DeviceWarning>,
 }
 
-impl Errand for Reading {
+impl Job for Reading {
+    type Device = dyn Edges;
     /// The number of edges, and the time of the last one.
-    type Answer = (u32, Option<Clock>);
+    type Out = (u32, Option<Clock>);
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<(u32, Option<Clock>), Shutdown> {
+    fn run(&mut self, edges: &mut Self::Device) -> Result<(u32, Option<Clock>), Shutdown> {
         // Take the time first. The kernel already has all edges up to it.
         let now = self.clock.now();
-        let Reading { edges, clock, settling, settle, interrupts, .. } = self;
+        let Reading { clock, settling, settle, interrupts, .. } = self;
         edges.take(&mut |Edge { at, level, dropped }| {
             if dropped > 0 {
                 settling.lose(dropped, level);
@@ -132,32 +134,39 @@ impl Errand for Reading {
             self.since = now;
             let per_s = u64::from(std::mem::take(&mut self.interrupts)) * u64::from(CLOCK_FREQ) / ticks;
             if per_s > u64::from(EDGES_PER_S_MAX) {
-                self.edges.end()?;
+                edges.end()?;
                 self.given_up = true;
-                warn!("{}", too_many(&self.name, per_s));
+                self.warning = Some(DeviceWarning::new(SUBJECT, too_many(&self.name, per_s)));
             }
         }
         Ok((self.settling.count, self.settling.last))
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
 /// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
-        "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
+        "{SUBJECT} ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
     )
 }
 
 /// For the log: nothing else counts a pin's edges, so it is polled.
 fn polled(name: &str, why: &str) -> String {
-    format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
+    format!("{SUBJECT} ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
-/// The errand that reads the kernel's edges, and its worker.
+/// The kernel's edges, and the job that reads them.
 struct Counted {
-    worker: WorkerId,
-    reading: Slot<Reading>,
+    edges: DeviceId<dyn Edges>,
+    reading: JobSlot<Reading>,
 }
+
+/// The number of the job that reads the kernel's edges. The pin's own reads have 0.
+const READING: u8 = 1;
 
 struct Counter {
     pin: InputLine,
@@ -179,27 +188,27 @@ struct Counter {
 
 impl Counter {
     /// Processes the level at a given time.
-    fn look(&mut self, turn: &mut Turn, level: bool, at: Clock) {
+    fn look(&mut self, context: &mut Context, level: bool, at: Clock) {
         if level != (self.count % 2 == 1) {
             self.count = self.count.wrapping_add(1);
             self.count_clock = at;
         }
         if self.next_sample < at {
             self.next_sample = at + self.sample_ticks;
-            self.tell(turn, at);
+            self.send_state(context, at);
         }
     }
 
     /// Reports the count as it was at a given time.
-    fn tell(&mut self, turn: &mut Turn, at: Clock) {
+    fn send_state(&mut self, context: &mut Context, at: Clock) {
         let next_clock = at + self.poll_ticks;
-        turn.send(State { oid: turn.oid(), next_clock, count: self.count, count_clock: self.count_clock });
+        context.send(State { oid: context.oid(), next_clock, count: self.count, count_clock: self.count_clock });
     }
 
     /// Processes the edges that the worker has read.
     fn has_read(
         &mut self,
-        turn: &mut Turn,
+        context: &mut Context,
         edges: Result<(u32, Option<Clock>), Shutdown>,
         ended: Clock,
     ) -> Result<(), Shutdown> {
@@ -209,11 +218,11 @@ impl Counter {
                 self.count = count;
                 self.count_clock = last.unwrap_or(self.count_clock);
                 if counts {
-                    self.tell(turn, ended);
+                    self.send_state(context, ended);
                 }
                 Ok(())
             }
-            Err(failure) => turn.try_shut_down(failure),
+            Err(failure) => context.try_shut_down(failure),
         }
     }
 }
@@ -223,27 +232,27 @@ impl Object for Counter {
         "counter"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        if let Some(Counted { worker, reading }) = &mut self.counted
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        if let Some(Counted { edges, reading }) = &mut self.counted
             && !reading.here().is_some_and(|reading| reading.given_up)
         {
             if self.next_sample <= at {
                 self.next_sample = at + self.sample_ticks.max(self.poll_ticks);
                 self.counts = true;
             }
-            // A worker that is still reading misses this turn.
+            // A worker that is still reading misses this read.
             if let Some(ready) = reading.here() {
                 ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
-                reading.send(turn, *worker)?;
+                reading.send(context, *edges)?;
             }
             return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
         // An expander that is still being read also misses it.
         if self.pin.is_looking() {
-            self.pin.awaited(turn)?;
+            self.pin.awaited(context)?;
         } else {
-            match self.pin.read(turn)? {
-                Some(level) => self.look(turn, level, at),
+            match self.pin.read(context)? {
+                Some(level) => self.look(context, level, at),
                 None => self.counts = true,
             }
         }
@@ -251,49 +260,49 @@ impl Object for Counter {
     }
 
     /// A worker has read the count, or the pin of an expander.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(counted) = &mut self.counted
-            && let Some(Back { result, ended, .. }) = counted.reading.back(done)
-        {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == READING {
+            let back = self.counted.as_mut().and_then(|counted| counted.reading.back(finished));
+            let Some(Back { result, ended, .. }) = back else { return Ok(()) };
             let edges = result.map_err(Shutdown::clone);
-            return self.has_read(turn, edges, ended);
+            return self.has_read(context, edges, ended);
         }
-        let Some(look) = self.pin.sampled(turn, done) else { return Ok(()) };
+        let Some(look) = self.pin.sampled(context, finished) else { return Ok(()) };
         let Look { level, ended, .. } = look?;
         if std::mem::take(&mut self.counts) {
             // A pin that could not be read keeps its last level.
-            self.look(turn, level.unwrap_or(self.count % 2 == 1), ended);
+            self.look(context, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.counts = false;
     }
 }
 
 const CONFIG_COUNTER: Command =
-    command!("config_counter oid=%c pin=%u pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
-        mcu.vacant(oid)?;
-        let (line, edges) = mcu.counted_input(pin, bias(pull_up))?;
-        let name = mcu.name(pin);
+    command!("config_counter oid=%c pin=%u pull_up=%c", |context, oid: Oid, pin: Pin, pull_up: i8| {
+        context.vacant(oid)?;
+        let (line, edges) = context.counted_input(pin, bias(pull_up))?;
+        let name = context.name(pin);
         let counted = match edges {
-            Ok((worker, edges)) => {
+            Ok(edges) => {
                 let level = line.prompt_level()?.unwrap_or_default();
                 let reading = Reading {
-                    edges,
-                    clock: mcu.clock(),
+                    clock: context.clock(),
                     name,
                     settling: Settling::new(level),
                     settle: Ticks(0),
-                    since: mcu.now(),
+                    since: context.now(),
                     interrupts: 0,
                     given_up: false,
+                    warning: None,
                 };
-                Some(Counted { worker, reading: Slot::new(reading) })
+                Some(Counted { edges, reading: JobSlot::numbered(READING, reading) })
             }
             Err(why) => {
-                warn!("{}", polled(&name, &why));
+                context.warn_of_device(&DeviceWarning::new(SUBJECT, polled(&name, &why)));
                 None
             }
         };
@@ -307,15 +316,15 @@ const CONFIG_COUNTER: Command =
             count_clock: Clock::EPOCH,
             counts: false,
         };
-        mcu.assign_on(pin, oid, counter)
+        context.assign_on(pin, oid, counter)
     });
 
 const QUERY_COUNTER: Command = command!(
     "query_counter oid=%c clock=%u poll_ticks=%u sample_ticks=%u",
     Counter,
-    |counter, turn, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    |counter, context, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         counter.poll_ticks = poll_ticks;
         counter.sample_ticks = sample_ticks;
         counter.next_sample = at;
@@ -323,7 +332,7 @@ const QUERY_COUNTER: Command = command!(
             counter.count_clock = at;
         }
         counter.counts = false;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );
 

@@ -6,7 +6,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Safe, Timer, Turn, WireClock, command,
+    Command, Context, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Timer, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -49,7 +49,6 @@ const KIND: &str = "digital output";
 
 struct DigitalOut {
     line: OutputLine,
-    shutdown_value: bool,
     max_duration: Ticks,
     cycle: Ticks,
     queue: MoveQueue<Move>,
@@ -67,15 +66,15 @@ struct DigitalOut {
 
 impl DigitalOut {
     /// Applies the oldest change of the queue, which was due at `at`.
-    fn load(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
-        let Some(Move { on_ticks, .. }) = self.queue.pop(&mut turn.moves) else {
+    fn load(&mut self, context: &mut Context, at: Clock) -> Result<Next, Shutdown> {
+        let Some(Move { on_ticks, .. }) = self.queue.pop(context.moves()) else {
             return Err(not_refreshed(MISSED_DIGITAL, self.max_duration).late_for(at));
         };
         let on = on_ticks.0 != 0;
-        self.line.write(turn, on)?;
+        self.line.write(context, on)?;
         self.on = on;
         self.toggling = on && on_ticks < self.cycle;
-        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.shutdown_value);
+        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.line.shutdown_value(context));
         self.end = limited.then(|| at + self.max_duration);
         if let Some(next) = self.queue.first() {
             if self.end.is_some_and(|end| end < next.at) {
@@ -100,8 +99,8 @@ impl DigitalOut {
     }
 
     /// Makes the edge of a pulse, which was due at `at`.
-    fn toggle(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle(turn)?;
+    fn toggle(&mut self, context: &mut Context, at: Clock) -> Result<Next, Shutdown> {
+        self.line.write(context, !self.on)?;
         self.on = !self.on;
         let mut next = at + if self.on { self.on_ticks } else { self.off_ticks };
         if let Some(end) = self.end
@@ -123,9 +122,9 @@ impl DigitalOut {
         }
     }
 
-    fn queue(&mut self, turn: &mut Turn, at: Clock, on_ticks: Ticks) -> Result<(), Shutdown> {
+    fn queue(&mut self, context: &mut Context, at: Clock, on_ticks: Ticks) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
-        self.queue.push(&mut turn.moves, Move { at, on_ticks })?;
+        self.queue.push(context.moves(), Move { at, on_ticks })?;
         if !first {
             return Ok(());
         }
@@ -137,27 +136,27 @@ impl DigitalOut {
             // `toggle` sees the new end and loads the change then.
             return Ok(());
         }
-        turn.cancel(TIMER);
+        context.cancel(TIMER);
         self.phase = Phase::Load;
         self.wake = at;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 
-    fn update(&mut self, turn: &mut Turn, value: bool) -> Result<(), Shutdown> {
+    fn update(&mut self, context: &mut Context, value: bool) -> Result<(), Shutdown> {
         if !self.queue.is_empty() {
             return Err(Shutdown::by_host(UPDATE_WITH_QUEUE, "update_digital_out came while changes are queued"));
         }
-        turn.cancel(TIMER);
-        self.line.write(turn, value)?;
+        context.cancel(TIMER);
+        self.line.write(context, value)?;
         self.on = value;
         self.toggling = false;
         self.end = None;
-        if value != self.shutdown_value && self.max_duration.0 != 0 {
-            let end = turn.now() + self.max_duration;
+        if value != self.line.shutdown_value(context) && self.max_duration.0 != 0 {
+            let end = context.now() + self.max_duration;
             self.end = Some(end);
             self.phase = Phase::Load;
             self.wake = end;
-            turn.schedule(TIMER, end)?;
+            context.schedule(TIMER, end)?;
         }
         Ok(())
     }
@@ -168,30 +167,22 @@ impl Object for DigitalOut {
         KIND
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         match self.phase {
-            Phase::Load => self.load(turn, at),
-            Phase::Toggle => self.toggle(turn, at),
+            Phase::Load => self.load(context, at),
+            Phase::Toggle => self.toggle(context, at),
         }
-    }
-
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        self.line.settle(turn, KIND, done)
     }
 
     fn report(&self) -> Report {
         Report { queued: self.queue.len(), value: None }
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.on = self.shutdown_value;
+    fn shutdown(&mut self, context: &mut Context) {
+        self.on = self.line.shutdown_value(context);
         self.toggling = false;
         self.end = None;
-        self.queue.clear(&mut turn.moves);
-    }
-
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.line.make_safe(turn, self.shutdown_value)
+        self.queue.clear(context.moves());
     }
 }
 
@@ -210,22 +201,22 @@ impl SetLines {
     /// # Errors
     ///
     /// "Unable to open out GPIO chip line" for a line that is refused, or for the 257th line; the errors of
-    /// [`Mcu::output`](crate::mcu::Mcu::output); "GPIO line write failed".
-    fn set(&mut self, turn: &mut Turn, pin: Pin, value: bool) -> Result<(), Shutdown> {
+    /// [`Context::kept_output`]; "GPIO line write failed".
+    fn set(&mut self, context: &mut Context, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
-            Some(place) if turn.is_finalized() => self.0[place].1.write(turn, value),
-            _ if turn.is_finalized() => Err(set_too_late(turn, reason::OUTPUT_LINE, "set_digital_out", pin)),
+            Some(place) if context.is_finalized() => self.0[place].1.write(context, value),
+            _ if context.is_finalized() => Err(set_too_late(context, reason::OUTPUT_LINE, "set_digital_out", pin)),
             // Claim the line again, so that the guardian learns the new level.
             Some(place) => {
-                self.0[place].1 = turn.output(pin, value, value)?;
+                self.0[place].1 = context.kept_output(pin, value)?;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::OUTPUT_LINE, "set_digital_out wants more than 256 lines"))
             }
             None => {
-                self.0.push((pin, turn.output(pin, value, value)?));
+                self.0.push((pin, context.kept_output(pin, value)?));
                 Ok(())
             }
         }
@@ -236,21 +227,15 @@ impl Object for SetLines {
     fn kind(&self) -> &'static str {
         "set_digital_out"
     }
-
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let mut lines = self.0.iter_mut();
-        lines.try_for_each(|(_, line)| line.settle(turn, "set_digital_out", done))
-    }
 }
 
 const CONFIG_DIGITAL_OUT: Command = command!(
     "config_digital_out oid=%c pin=%u value=%c default_value=%c max_duration=%u",
-    |mcu, oid: Oid, pin: Pin, value: bool, default_value: bool, max_duration: Ticks| {
-        mcu.vacant(oid)?;
-        let line = mcu.output(pin, value, default_value)?;
+    |context, oid: Oid, pin: Pin, value: bool, default_value: bool, max_duration: Ticks| {
+        context.vacant(oid)?;
+        let line = context.output(pin, value, default_value)?;
         let output = DigitalOut {
             line,
-            shutdown_value: default_value,
             max_duration,
             cycle: Ticks(0),
             queue: MoveQueue::default(),
@@ -262,7 +247,7 @@ const CONFIG_DIGITAL_OUT: Command = command!(
             wake: Clock::EPOCH,
             end: None,
         };
-        mcu.assign_on(pin, oid, output)
+        context.assign_on(pin, oid, output)
     }
 );
 
@@ -281,16 +266,17 @@ const SET_DIGITAL_OUT_PWM_CYCLE: Command =
 const QUEUE_DIGITAL_OUT: Command = command!(
     "queue_digital_out oid=%c clock=%u on_ticks=%u",
     DigitalOut,
-    |output, turn, clock: WireClock, on_ticks: Ticks| {
-        let at = turn.instant(clock);
-        output.queue(turn, at, on_ticks)
+    |output, context, clock: WireClock, on_ticks: Ticks| {
+        let at = context.instant(clock);
+        output.queue(context, at, on_ticks)
     }
 );
 
 const UPDATE_DIGITAL_OUT: Command =
-    command!("update_digital_out oid=%c value=%c", DigitalOut, |output, turn, value: bool| output.update(turn, value));
+    command!("update_digital_out oid=%c value=%c", DigitalOut, |output, context, value: bool| output
+        .update(context, value));
 
-const SET_DIGITAL_OUT: Command = command!("set_digital_out pin=%u value=%c", |mcu, pin: Pin, value: bool| {
-    let oid = mcu.own::<SetLines>();
-    mcu.with::<SetLines, _>(oid, |lines, turn| lines.set(turn, pin, value))
+const SET_DIGITAL_OUT: Command = command!("set_digital_out pin=%u value=%c", |context, pin: Pin, value: bool| {
+    let oid = context.own::<SetLines>();
+    context.with::<SetLines, _>(oid, |lines, context| lines.set(context, pin, value))
 });

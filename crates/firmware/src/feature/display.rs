@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};
-use crate::mcu::{Done, Mcu, Object, Remote, Safe, Settable, Turn};
+use crate::mcu::{Context, Finished, Object, Remote, Safe, Settable};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -40,7 +40,7 @@ pub(super) enum Update {
     Idle,
 }
 
-/// A panel and the pace of its errands.
+/// A panel and the pace of its jobs.
 struct Paced<P> {
     panel: P,
     pace: Pace,
@@ -69,18 +69,17 @@ pub(super) struct Display<P: Panel> {
 
 impl<P: Panel> Display<P> {
     /// Makes a display. Its lines are already at their idle levels.
-    pub(super) fn new(mcu: &mut Mcu, kind: &'static str, pace: Pace, panel: P) -> Result<Display<P>, Shutdown> {
-        let worker = mcu.worker(WORKER)?;
-        let panel = Remote::new(worker, Paced { panel, pace: pace.clone() }, Update::Idle);
-        Ok(Display { kind, pace, panel })
+    pub(super) fn new(context: &mut Context, kind: &'static str, pace: Pace, panel: P) -> Result<Display<P>, Shutdown> {
+        let panel = context.device(WORKER, Box::new(Paced { panel, pace: pace.clone() }))?;
+        Ok(Display { kind, pace, panel: Remote::new(0, panel, Update::Idle) })
     }
 
     /// Writes bytes. The commands behind this one wait until the display has them.
-    pub(super) fn write(&mut self, turn: &mut Turn, register: Register, data: &[u8]) -> Result<(), Shutdown> {
+    pub(super) fn write(&mut self, context: &mut Context, register: Register, data: &[u8]) -> Result<(), Shutdown> {
         let mut bytes = [0; PAYLOAD_MAX];
         let len = data.len().min(PAYLOAD_MAX);
         bytes[..len].copy_from_slice(&data[..len]);
-        self.panel.set(turn, Update::Write { register, bytes, len })
+        self.panel.set(context, Update::Write { register, bytes, len })
     }
 }
 
@@ -89,14 +88,14 @@ impl<P: Panel> Object for Display<P> {
         self.kind
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        self.panel.settle(turn, self.kind, done)
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        self.panel.settle(context, self.kind, finished)
     }
 
     /// Aborts a write that is under way.
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
         self.pace.stop();
-        self.panel.set(turn, Update::Idle)?;
+        self.panel.set(context, Update::Idle)?;
         Ok(Safe::Later)
     }
 }
@@ -109,8 +108,8 @@ pub(super) struct Wire {
 
 impl Wire {
     /// Claims a line at low level.
-    pub(super) fn claim(mcu: &mut Mcu, pin: Pin) -> Result<Wire, Shutdown> {
-        Ok(Wire { line: mcu.shared_output(pin, false)?, level: false })
+    pub(super) fn claim(context: &mut Context, pin: Pin) -> Result<Wire, Shutdown> {
+        Ok(Wire { line: context.shared_output(pin, false)?, level: false })
     }
 
     pub(super) fn set(&mut self, level: bool) -> Result<(), Shutdown> {
@@ -140,7 +139,7 @@ impl Busy {
         Busy { pace, since: None }
     }
 
-    /// Waits until `ticks` after the last byte. False: the errand must end.
+    /// Waits until `ticks` after the last byte. False: the job must end.
     pub(super) fn over(&self, ticks: Ticks) -> bool {
         self.pace.until(self.since.map_or_else(|| self.pace.now(), |since| since + ticks))
     }

@@ -7,10 +7,10 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{OnWorker, Thermometer};
+use crate::board::Thermometer;
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, Generation::Kalico, Generations, Mcu, Next, Object, Oid, Response, Slot,
-    Timer, Turn, WireClock, WorkerId, command, response, since,
+    Back, Command, Context, DeviceId, Feature, Finished, Generation::Kalico, Generations, Job, JobSlot, Next, Object,
+    Oid, Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -47,20 +47,21 @@ const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 const TIMER: Timer = Timer::sampling(0);
 
 /// One reading.
-struct Look(Box<dyn Thermometer>);
+struct Look;
 
-impl Errand for Look {
-    type Answer = i32;
+impl Job for Look {
+    type Device = dyn Thermometer;
+    type Out = i32;
     type Failure = Trouble;
 
-    fn run(&mut self) -> Result<i32, Trouble> {
-        self.0.read()
+    fn run(&mut self, thermometer: &mut Self::Device) -> Result<i32, Trouble> {
+        thermometer.read()
     }
 }
 
 struct Ds18b20 {
-    worker: WorkerId,
-    look: Slot<Look>,
+    thermometer: DeviceId<dyn Thermometer>,
+    look: JobSlot<Look>,
     /// When the reading under way was requested.
     asked: Clock,
     /// When the next reading is due.
@@ -77,12 +78,12 @@ struct Ds18b20 {
 }
 
 impl Ds18b20 {
-    fn check_range(&self, mcu: &Mcu) -> Result<(), Shutdown> {
+    fn check_range(&self, context: &Context) -> Result<(), Shutdown> {
         if self.ignores_limits || (self.min_value..=self.max_value).contains(&self.value) {
             return Ok(());
         }
         let celsius = |value: i32| f64::from(value) / 1000.;
-        mcu.try_shut_down(Shutdown::because(
+        context.try_shut_down(Shutdown::because(
             OUT_OF_RANGE,
             format!(
                 "it read {} C where {} C to {} C is allowed: what it watches is past its limits, or the sensor is broken (85 C is what it says when its supply just came back)",
@@ -99,14 +100,14 @@ impl Object for Ds18b20 {
         "DS18B20"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
         if self.look.is_here() {
             self.asked = at;
             self.next_clock = next;
-            self.look.send(turn, self.worker)?;
+            self.look.send(context, self.thermometer)?;
         } else if at.since(self.asked) > READ_LIMIT {
-            turn.try_shut_down(Shutdown::because(
+            context.try_shut_down(Shutdown::because(
                 TOO_SLOW,
                 Trouble::new("its reading is under way for more than 5 s")
                     .remedy("look at the kernel's log (dmesg), or connect fewer sensors to one wire"),
@@ -115,8 +116,8 @@ impl Object for Ds18b20 {
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
         match result {
             Ok(value) => {
                 self.value = value;
@@ -127,37 +128,42 @@ impl Object for Ds18b20 {
                 if self.error_count > self.max_error_count {
                     let times = self.error_count;
                     let cause = format!("{} ({times} readings in a row failed)", trouble.cause).into();
-                    return turn.try_shut_down(Shutdown::because(READ_FAILED, Trouble { cause, ..trouble.clone() }));
+                    return context.try_shut_down(Shutdown::because(READ_FAILED, Trouble { cause, ..trouble.clone() }));
                 }
             }
         }
         let fault = self.error_count;
-        turn.send(Reading { oid: turn.oid(), next_clock: self.next_clock, value: self.value, fault: fault.into() });
-        if fault == 0 { self.check_range(turn) } else { Ok(()) }
+        context.send(Reading {
+            oid: context.oid(),
+            next_clock: self.next_clock,
+            value: self.value,
+            fault: fault.into(),
+        });
+        if fault == 0 { self.check_range(context) } else { Ok(()) }
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.look.drop_pending();
     }
 }
 
 fn configure(
-    mcu: &mut Mcu,
+    context: &mut Context,
     oid: Oid,
     serial: &[u8],
     max_error_count: u8,
     ignores_limits: bool,
 ) -> Result<(), Shutdown> {
-    mcu.vacant(oid)?;
+    context.vacant(oid)?;
     if serial.contains(&b'/') {
         let serial = String::from_utf8_lossy(serial);
         let remedy = "serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab";
         return Err(Shutdown::because(INVALID_SERIAL, format!("{serial:?} is no sensor")).remedy(remedy));
     }
-    let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
+    let thermometer = context.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {
-        worker: mcu.reader(&bus)?,
-        look: Slot::new(Look(device)),
+        thermometer: context.reader(thermometer)?,
+        look: JobSlot::new(Look),
         asked: Clock::EPOCH,
         next_clock: Clock::EPOCH,
         rest_ticks: Ticks(0),
@@ -168,19 +174,19 @@ fn configure(
         error_count: 0,
         value: 0,
     };
-    mcu.assign(oid, sensor)
+    context.assign(oid, sensor)
 }
 
 const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
-    |mcu, oid: Oid, serial: &[u8], max_error_count: u8| configure(mcu, oid, serial, max_error_count, false)
+    |context, oid: Oid, serial: &[u8], max_error_count: u8| configure(context, oid, serial, max_error_count, false)
 )
 .of(Generations::ALL.except(Kalico));
 
 const CONFIG_DS18B20_OF_KALICO: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c ignore_limits=%c",
-    |mcu, oid: Oid, serial: &[u8], max_error_count: u8, ignore_limits: bool| {
-        configure(mcu, oid, serial, max_error_count, ignore_limits)
+    |context, oid: Oid, serial: &[u8], max_error_count: u8, ignore_limits: bool| {
+        configure(context, oid, serial, max_error_count, ignore_limits)
     }
 )
 .of(since(Kalico));
@@ -188,9 +194,9 @@ const CONFIG_DS18B20_OF_KALICO: Command = command!(
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",
     Ds18b20,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         sensor.look.drop_pending();
         if rest_ticks == Ticks(0) {
             return Ok(());
@@ -198,6 +204,6 @@ const QUERY_DS18B20: Command = command!(
         sensor.rest_ticks = rest_ticks;
         sensor.min_value = min_value;
         sensor.max_value = max_value;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );

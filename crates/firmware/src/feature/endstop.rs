@@ -5,8 +5,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, Turn, UNREAD_LIMIT, WireClock,
-    command, response,
+    Command, Context, Feature, Finished, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, UNREAD_LIMIT,
+    WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -56,18 +56,18 @@ struct Homing {
 
 impl Endstop {
     /// Takes the sample that is due at `at`, or makes the chip's worker take it.
-    fn sample(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
-        match self.pin.read(turn)? {
-            Some(level) => self.judge(turn, level, at, at),
+    fn sample(&mut self, context: &mut Context, at: Clock) -> Result<Next, Shutdown> {
+        match self.pin.read(context)? {
+            Some(level) => self.judge(context, level, at, at),
             None => {
                 self.due = Some(at);
-                Ok(Next::At(turn.last_read() + UNREAD_LIMIT))
+                Ok(Next::At(context.last_read() + UNREAD_LIMIT))
             }
         }
     }
 
     /// Decides what comes next. The sample was due at `at` and taken at `seen`.
-    fn judge(&mut self, turn: &mut Turn, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
+    fn judge(&mut self, context: &mut Context, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
         if level != homing.pin_value {
@@ -82,29 +82,34 @@ impl Endstop {
             return Ok(Next::At(at + homing.sample_ticks));
         }
         let Homing { trsync, trigger_reason, .. } = *homing;
-        turn.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, trigger_reason))?;
+        context.with::<Trsync, _>(trsync, |trsync, context| trsync.trigger(context, trigger_reason))?;
         Ok(Next::Done)
     }
 
-    fn query(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        match self.pin.read(turn)? {
-            Some(level) => self.report(turn, level),
-            None => self.asked = Some(turn.hold()),
+    fn query(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        match self.pin.read(context)? {
+            Some(level) => self.report(context, level),
+            None => self.asked = Some(context.hold()),
         }
         Ok(())
     }
 
     /// Answers the waiting query. There is no answer if the MCU is stopped and the chip fails.
-    fn answer(&mut self, turn: &mut Turn, level: Option<bool>) {
+    fn answer(&mut self, context: &mut Context, level: Option<bool>) {
         let Some(hold) = self.asked.take() else { return };
         if let Some(level) = level {
-            self.report(turn, level);
+            self.report(context, level);
         }
-        turn.release(hold);
+        context.release(hold);
     }
 
-    fn report(&self, turn: &mut Turn, pin_value: bool) {
-        turn.send(State { oid: turn.oid(), homing: self.homing.is_some(), next_clock: self.next_wake, pin_value });
+    fn report(&self, context: &mut Context, pin_value: bool) {
+        context.send(State {
+            oid: context.oid(),
+            homing: self.homing.is_some(),
+            next_clock: self.next_wake,
+            pin_value,
+        });
     }
 }
 
@@ -113,54 +118,54 @@ impl Object for Endstop {
         "endstop"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if self.due.is_some() {
-            self.pin.awaited(turn)?;
+            self.pin.awaited(context)?;
             return Ok(Next::At(at + UNREAD_LIMIT));
         }
-        self.sample(turn, at)
+        self.sample(context, at)
     }
 
     /// The chip's worker has read the line.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
         let is_homing = self.due.is_some();
-        let look = if is_homing { self.pin.seen(turn, done) } else { self.pin.sampled(turn, done) };
+        let look = if is_homing { self.pin.seen(context, finished) } else { self.pin.sampled(context, finished) };
         let Some(look) = look else { return Ok(()) };
         let Look { level, began, ended } = look?;
         match level {
             // A query needs a level, so the line is read again.
-            None if self.asked.is_some() && !turn.is_shutdown() => self.pin.read(turn).map(drop)?,
-            _ => self.answer(turn, level),
+            None if self.asked.is_some() && !context.is_shutdown() => self.pin.read(context).map(drop)?,
+            _ => self.answer(context, level),
         }
         let (Some(at), Some(level)) = (self.due.take(), level) else { return Ok(()) };
-        turn.cancel(TIMER);
+        context.cancel(TIMER);
         // The worker may have read the line for a query, before the sample was due. Then it reads again.
-        let next = if began < at { self.sample(turn, at)? } else { self.judge(turn, level, at, ended)? };
+        let next = if began < at { self.sample(context, at)? } else { self.judge(context, level, at, ended)? };
         if let Next::At(at) = next {
-            let now = turn.now();
-            turn.go_on(TIMER, at.max(now));
+            let now = context.now();
+            context.go_on(TIMER, at.max(now));
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.due = None;
     }
 }
 
 const CONFIG_ENDSTOP: Command =
-    command!("config_endstop oid=%c pin=%c pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
-        mcu.vacant(oid)?;
-        let input = mcu.input(pin, bias(pull_up))?;
+    command!("config_endstop oid=%c pin=%c pull_up=%c", |context, oid: Oid, pin: Pin, pull_up: i8| {
+        context.vacant(oid)?;
+        let input = context.input(pin, bias(pull_up))?;
         let endstop = Endstop { pin: input, homing: None, next_wake: Clock::EPOCH, due: None, asked: None };
-        mcu.assign_on(pin, oid, endstop)
+        context.assign_on(pin, oid, endstop)
     });
 
 const ENDSTOP_HOME: Command = command!(
     "endstop_home oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u pin_value=%c trsync_oid=%c trigger_reason=%c",
     Endstop,
     |endstop,
-     turn,
+     context,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -168,14 +173,14 @@ const ENDSTOP_HOME: Command = command!(
      pin_value: bool,
      trsync_oid: Oid,
      trigger_reason: u8| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         endstop.homing = None;
         endstop.due = None;
         if sample_count == 0 {
             return Ok(());
         }
-        turn.require::<Trsync>(trsync_oid)?;
+        context.require::<Trsync>(trsync_oid)?;
         endstop.homing = Some(Homing {
             sample_ticks,
             sample_count,
@@ -185,9 +190,9 @@ const ENDSTOP_HOME: Command = command!(
             trigger_reason,
             wanted: sample_count,
         });
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );
 
 const ENDSTOP_QUERY_STATE: Command =
-    command!("endstop_query_state oid=%c", Endstop, |endstop, turn| endstop.query(turn));
+    command!("endstop_query_state oid=%c", Endstop, |endstop, context| endstop.query(context));

@@ -4,14 +4,14 @@
 //!
 //! A reading takes the samples that are there, at most those of one message. So other devices on the bus get their
 //! turn. If the chip has more, the next reading follows at once, otherwise after `rest_ticks`. For hosts up to v0.12
-//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all conversations of a bus in order,
+//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all jobs of a bus in order,
 //! and returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Back, Conversation, Done, Enumeration, Feature, Generation::V0_13, Mcu, Next, Object, Oid, Slot, Talk, Timer, Turn,
+    Back, Chip, Context, Enumeration, Feature, Finished, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Timer,
     WireClock, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
@@ -34,6 +34,12 @@ shutdowns! {
 }
 
 const TIMER: Timer = Timer::sampling(0);
+
+// The numbers of the jobs.
+const READ: u8 = 0;
+const SWITCH: u8 = 1;
+const OVERFLOW: u8 = 2;
+const FILL: u8 = 3;
 
 /// The kind of bus that a chip is on (`bus_oid_type`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,11 +80,11 @@ impl BusType {
         }
     }
 
-    /// The shutdown for a sensor's failed conversation.
-    pub(super) fn failed(self, mcu: &Mcu, error: BusError) -> Shutdown {
+    /// The shutdown for a sensor's failed job.
+    pub(super) fn failed(self, context: &Context, error: BusError) -> Shutdown {
         match self {
             BusType::Spi => spi_shutdown(error),
-            BusType::I2c => i2c_shutdown(mcu, error),
+            BusType::I2c => i2c_shutdown(context, error),
         }
     }
 }
@@ -214,10 +220,12 @@ struct Read<C> {
     reading: Reading,
 }
 
-impl<C: FifoChip> Talk for Read<C> {
-    type Answer = Reading;
+impl<C: FifoChip> Job for Read<C> {
+    type Device = Chip;
+    type Out = Reading;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Reading, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Reading, BusError> {
         self.chip.read(chip, &mut self.reading)?;
         Ok(self.reading)
     }
@@ -226,22 +234,26 @@ impl<C: FifoChip> Talk for Read<C> {
 /// Asks how full the FIFO is.
 struct LookAtFill<C>(C);
 
-impl<C: FifoChip> Talk for LookAtFill<C> {
-    type Answer = Option<Fill>;
+impl<C: FifoChip> Job for LookAtFill<C> {
+    type Device = Chip;
+    type Out = Option<Fill>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Option<Fill>, BusError> {
         self.0.fill(chip)
     }
 }
 
-/// Asks for overflows, if a separate register reports them. This is a separate conversation: the time of a status is
+/// Asks for overflows, if a separate register reports them. This is a separate job: the time of a status is
 /// the time of the question for the fill level alone.
 struct LookForOverflow<C>(C);
 
-impl<C: FifoChip> Talk for LookForOverflow<C> {
-    type Answer = bool;
+impl<C: FifoChip> Job for LookForOverflow<C> {
+    type Device = Chip;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         self.0.overflowed(chip)
     }
 }
@@ -252,11 +264,13 @@ struct Switch<C> {
     on: bool,
 }
 
-impl<C: FifoChip> Talk for Switch<C> {
+impl<C: FifoChip> Job for Switch<C> {
+    type Device = Chip;
     /// Whether the sensor is on now.
-    type Answer = bool;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         if self.on { self.chip.switch_on(chip) } else { self.chip.switch_off(chip) }?;
         Ok(self.on)
     }
@@ -286,12 +300,12 @@ pub(super) struct FifoSensor<C: FifoChip> {
     bulk: SensorBulk,
     rest_ticks: Ticks,
     phase: Phase,
-    switch: Slot<Conversation<Switch<C>>>,
-    read: Slot<Conversation<Read<C>>>,
+    switch: JobSlot<Switch<C>>,
+    read: JobSlot<Read<C>>,
     /// Whether a reading is due as soon as the one under way is over.
     waiting: bool,
-    fill: Slot<Conversation<LookAtFill<C>>>,
-    overflow: Slot<Conversation<LookForOverflow<C>>>,
+    fill: JobSlot<LookAtFill<C>>,
+    overflow: JobSlot<LookForOverflow<C>>,
 }
 
 impl<C: FifoChip> FifoSensor<C> {
@@ -300,27 +314,27 @@ impl<C: FifoChip> FifoSensor<C> {
     const NONSENSE_BYTES: u32 = 0x7f * C::SAMPLE_BYTES as u32;
 
     /// Starts a reading, or makes one follow the reading under way.
-    fn read(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        let Some(Conversation { talk: Read { reading, .. }, .. }) = self.read.here() else {
+    fn read(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        let Some(Read { reading, .. }) = self.read.here() else {
             self.waiting = true;
             return Ok(());
         };
         (reading.len, reading.room, reading.overflows) = (0, self.bulk.room(), 0);
-        self.read.converse(turn, self.device)
+        self.read.send_to(context, self.device)
     }
 
-    fn has_read(&mut self, turn: &mut Turn, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
+    fn has_read(&mut self, context: &mut Context, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
         self.bulk.count_overflows(reading.overflows);
         for sample in reading.samples[..reading.len].chunks(C::SAMPLE_BYTES) {
-            self.bulk.add(turn, sample);
+            self.bulk.add(context, sample);
         }
         match self.phase {
             // Nothing more is read before the sensor is off.
             Phase::Ends(None, _) => Ok(()),
-            Phase::Ends(Some(_), _) => self.ask_status(turn),
-            _ if reading.more => self.read(turn),
+            Phase::Ends(Some(_), _) => self.ask_status(context),
+            _ if reading.more => self.read(context),
             _ => {
-                turn.go_on(TIMER, ended + self.rest_ticks);
+                context.go_on(TIMER, ended + self.rest_ticks);
                 Ok(())
             }
         }
@@ -337,78 +351,83 @@ impl<C: FifoChip> FifoSensor<C> {
     /// Notes how many bytes the chip has. A reading under way knows better and is left alone.
     fn has_pending(&mut self, bytes: u16) {
         if let Some(read) = self.read.here() {
-            read.talk.reading.pending = bytes;
+            read.reading.pending = bytes;
         }
     }
 
-    fn failed(&mut self, turn: &mut Turn, error: BusError) -> Result<(), Shutdown> {
-        let failure = self.chip.bus_type().failed(turn, error);
-        turn.device_failed(C::NAME, failure)
+    fn failed(&mut self, context: &mut Context, error: BusError) -> Result<(), Shutdown> {
+        let failure = self.chip.bus_type().failed(context, error);
+        context.device_failed(C::NAME, failure)
     }
 
-    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
         // A switch is under way. `switched` then does what is wanted by that time.
         let Some(switch) = self.switch.here() else { return Ok(()) };
-        switch.talk.on = on;
-        self.switch.converse(turn, self.device)
+        switch.on = on;
+        self.switch.send_to(context, self.device)
     }
 
     /// The sensor is now on, or off.
-    fn switched(&mut self, turn: &mut Turn, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
+    fn switched(&mut self, context: &mut Context, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
         match self.phase {
             // It was switched for an earlier query.
             Phase::Idle | Phase::Begins => Ok(()),
-            Phase::SwitchesOn if !on => self.switch(turn, true),
+            Phase::SwitchesOn if !on => self.switch(context, true),
             Phase::SwitchesOn => {
                 self.phase = Phase::Idle;
-                turn.go_on(TIMER, span.1 + self.rest_ticks);
+                context.go_on(TIMER, span.1 + self.rest_ticks);
                 Ok(())
             }
-            Phase::Ends(..) if on => self.switch(turn, false),
+            Phase::Ends(..) if on => self.switch(context, false),
             Phase::Ends(..) => {
                 self.phase = Phase::Ends(Some(span), LAST_READS);
-                self.ask_status(turn)
+                self.ask_status(context)
             }
         }
     }
 
     /// Measures from `clock` on, for a host up to v0.12. The MCU switches the sensor on and off. The number of samples
     /// answers the end. `rest_ticks` of 0 ends the measurement.
-    pub(super) fn query_at(&mut self, turn: &mut Turn, clock: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+    pub(super) fn query_at(
+        &mut self,
+        context: &mut Context,
+        clock: WireClock,
+        rest_ticks: Ticks,
+    ) -> Result<(), Shutdown> {
         if rest_ticks == Ticks(0) {
-            return self.stop(turn);
+            return self.stop(context);
         }
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         self.end();
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
         self.phase = Phase::Begins;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 
     /// Switches the sensor off, sends the remaining samples, and reports their number to the host. A reading under way
     /// counts.
-    fn stop(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    fn stop(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.waiting = false;
         self.phase = Phase::Ends(None, LAST_READS);
-        self.switch(turn, false)
+        self.switch(context, false)
     }
 
     /// Processes the chip's answer about its FIFO. `None`: the answer makes no sense.
-    fn has_filled(&mut self, turn: &mut Turn, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
+    fn has_filled(&mut self, context: &mut Context, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
         if let Phase::Ends(Some(off), reads) = self.phase {
-            return self.ended(turn, off, fill, reads);
+            return self.ended(context, off, fill, reads);
         }
         match fill {
             Some(Fill { bytes, overflowed }) => {
                 self.bulk.count_overflows(overflowed.into());
                 self.has_pending(bytes);
-                self.bulk.send_status(turn, span, bytes.into());
+                self.bulk.send_status(context, span, bytes.into());
             }
-            None if C::OWN_WORDS.is_some() && !turn.speaks::<BulkData<'_>>() => {
-                self.bulk.send_status(turn, span, Self::NONSENSE_BYTES);
+            None if C::OWN_WORDS.is_some() && !context.speaks::<BulkData<'_>>() => {
+                self.bulk.send_status(context, span, Self::NONSENSE_BYTES);
             }
             // Since v0.13, klippy asks again if it gets no answer.
             None => {}
@@ -417,45 +436,51 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     /// The same after the sensor was switched off.
-    fn ended(&mut self, turn: &mut Turn, off: (Clock, Clock), fill: Option<Fill>, reads: u8) -> Result<(), Shutdown> {
+    fn ended(
+        &mut self,
+        context: &mut Context,
+        off: (Clock, Clock),
+        fill: Option<Fill>,
+        reads: u8,
+    ) -> Result<(), Shutdown> {
         let bytes = fill.map(|fill| fill.bytes);
         // After an answer that makes no sense the chip is asked again, because samples may be left.
         if C::KEEPS_SAMPLES && bytes != Some(0) && reads > 0 {
             self.phase = Phase::Ends(Some(off), reads - 1);
-            return if bytes.is_none() { self.ask_status(turn) } else { self.read(turn) };
+            return if bytes.is_none() { self.ask_status(context) } else { self.read(context) };
         }
         self.phase = Phase::Idle;
-        self.bulk.flush(turn);
-        self.bulk.send_status(turn, off, bytes.map_or(Self::NONSENSE_BYTES, u32::from));
+        self.bulk.flush(context);
+        self.bulk.send_status(context, off, bytes.map_or(Self::NONSENSE_BYTES, u32::from));
         Ok(())
     }
 
     /// Measures, with `rest_ticks` between two looks into the FIFO. `rest_ticks` of 0 ends the measurement.
-    pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    pub(super) fn query(&mut self, context: &mut Context, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
-        let at = turn.now() + rest_ticks;
-        turn.go_on(TIMER, at);
+        let at = context.now() + rest_ticks;
+        context.go_on(TIMER, at);
         Ok(())
     }
 
     /// Asks the sensor how many samples it has.
-    pub(super) fn ask_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    pub(super) fn ask_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if !C::HAS_OVERFLOW_REGISTER {
-            return self.ask_fill(turn);
+            return self.ask_fill(context);
         }
         self.overflow.here().ok_or_else(status_amid_status)?;
-        self.overflow.converse(turn, self.device)
+        self.overflow.send_to(context, self.device)
     }
 
-    fn ask_fill(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn ask_fill(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         self.fill.here().ok_or_else(status_amid_status)?;
-        self.fill.converse(turn, self.device)
+        self.fill.send_to(context, self.device)
     }
 }
 
@@ -470,73 +495,80 @@ impl<C: FifoChip> Object for FifoSensor<C> {
         C::NAME
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         if self.phase == Phase::Begins {
             self.phase = Phase::SwitchesOn;
-            self.switch(turn, true)?;
+            self.switch(context, true)?;
         } else {
-            self.read(turn)?;
+            self.read(context)?;
         }
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let error = if let Some(Back { result, counts, ended, .. }) = self.read.back(done) {
-            let result = result.map_err(BusError::clone);
-            if !counts {
-                self.has_pending(0);
-            }
-            match result {
-                Ok(reading) if counts => return self.has_read(turn, reading, ended),
-                Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(turn) } else { Ok(()) },
-                Err(error) => error,
-            }
-        } else if let Some(Back { result, began, ended, .. }) = self.switch.back(done) {
-            match result {
-                Ok(on) => return self.switched(turn, on, (began, ended)),
-                Err(error) => error.clone(),
-            }
-        } else if let Some(Back { result, .. }) = self.overflow.back(done) {
-            match result {
-                Ok(overflowed) => {
-                    self.bulk.count_overflows(overflowed.into());
-                    return self.ask_fill(turn);
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let error = match number {
+            SWITCH => {
+                let Some(Back { result, began, ended, .. }) = self.switch.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(on) => return self.switched(context, on, (began, ended)),
+                    Err(error) => error.clone(),
                 }
-                Err(error) => error.clone(),
             }
-        } else if let Some(Back { result, began, ended, .. }) = self.fill.back(done) {
-            match result {
-                Ok(fill) => return self.has_filled(turn, fill, (began, ended)),
-                Err(error) => error.clone(),
+            OVERFLOW => {
+                let Some(Back { result, .. }) = self.overflow.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(overflowed) => {
+                        self.bulk.count_overflows(overflowed.into());
+                        return self.ask_fill(context);
+                    }
+                    Err(error) => error.clone(),
+                }
             }
-        } else {
-            return Ok(());
+            FILL => {
+                let Some(Back { result, began, ended, .. }) = self.fill.back(finished) else { return Ok(()) };
+                match result {
+                    Ok(fill) => return self.has_filled(context, fill, (began, ended)),
+                    Err(error) => error.clone(),
+                }
+            }
+            _ => {
+                let Some(Back { result, is_wanted, ended, .. }) = self.read.back(finished) else { return Ok(()) };
+                let result = result.map_err(BusError::clone);
+                if !is_wanted {
+                    self.has_pending(0);
+                }
+                match result {
+                    Ok(reading) if is_wanted => return self.has_read(context, reading, ended),
+                    Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(context) } else { Ok(()) },
+                    Err(error) => error,
+                }
+            }
         };
-        self.failed(turn, error)
+        self.failed(context, error)
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.end();
     }
 }
 
 /// Makes a sensor with this `oid`, on the bus device `device`.
-pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
+pub(super) fn configure<C: FifoChip>(context: &mut Context, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
     match chip.bus_type() {
-        BusType::Spi => mcu.require::<Spi>(device)?,
-        BusType::I2c => mcu.require::<I2c>(device)?,
+        BusType::Spi => context.require::<Spi>(device)?,
+        BusType::I2c => context.require::<I2c>(device)?,
     }
     let sensor = FifoSensor {
         chip,
         device,
-        bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(mcu, own)),
+        bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(context, own)),
         rest_ticks: Ticks(0),
         phase: Phase::Idle,
-        switch: Slot::talking(Switch { chip, on: false }),
-        read: Slot::talking(Read { chip, reading: Reading::new() }),
+        switch: JobSlot::numbered(SWITCH, Switch { chip, on: false }),
+        read: JobSlot::numbered(READ, Read { chip, reading: Reading::new() }),
         waiting: false,
-        fill: Slot::talking(LookAtFill(chip)),
-        overflow: Slot::talking(LookForOverflow(chip)),
+        fill: JobSlot::numbered(FILL, LookAtFill(chip)),
+        overflow: JobSlot::numbered(OVERFLOW, LookForOverflow(chip)),
     };
-    mcu.assign(oid, sensor)
+    context.assign(oid, sensor)
 }

@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::Pin;
-use crate::mcu::{Command, Feature, Mcu, Oid, command};
+use crate::mcu::{Command, Context, Feature, Oid, command};
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
@@ -33,15 +33,20 @@ struct Hd44780 {
 }
 
 impl Hd44780 {
-    fn claim(mcu: &mut Mcu, pace: Pace, pins: [Pin; 6], delay: Ticks) -> Result<Hd44780, Shutdown> {
+    fn claim(context: &mut Context, pace: Pace, pins: [Pin; 6], delay: Ticks) -> Result<Hd44780, Shutdown> {
         let [rs, e, data @ ..] = pins;
         let [d4, d5, d6, d7] = data;
         Ok(Hd44780 {
             busy: Busy::new(pace),
             delay,
-            rs: Wire::claim(mcu, rs)?,
-            e: Wire::claim(mcu, e)?,
-            data: [Wire::claim(mcu, d4)?, Wire::claim(mcu, d5)?, Wire::claim(mcu, d6)?, Wire::claim(mcu, d7)?],
+            rs: Wire::claim(context, rs)?,
+            e: Wire::claim(context, e)?,
+            data: [
+                Wire::claim(context, d4)?,
+                Wire::claim(context, d5)?,
+                Wire::claim(context, d6)?,
+                Wire::claim(context, d7)?,
+            ],
         })
     }
 
@@ -81,24 +86,32 @@ type Screen = Display<Hd44780>;
 
 const CONFIG_HD44780: Command = command!(
     "config_hd44780 oid=%c rs_pin=%u e_pin=%u d4_pin=%u d5_pin=%u d6_pin=%u d7_pin=%u delay_ticks=%u",
-    |mcu, oid: Oid, rs_pin: Pin, e_pin: Pin, d4_pin: Pin, d5_pin: Pin, d6_pin: Pin, d7_pin: Pin, delay_ticks: Ticks| {
-        mcu.vacant(oid)?;
-        let pace = Pace::new(mcu);
+    |context,
+     oid: Oid,
+     rs_pin: Pin,
+     e_pin: Pin,
+     d4_pin: Pin,
+     d5_pin: Pin,
+     d6_pin: Pin,
+     d7_pin: Pin,
+     delay_ticks: Ticks| {
+        context.vacant(oid)?;
+        let pace = Pace::new(context);
         let pins = [rs_pin, e_pin, d4_pin, d5_pin, d6_pin, d7_pin];
-        let panel = Hd44780::claim(mcu, pace.clone(), pins, delay_ticks)?;
-        let display = Display::new(mcu, "HD44780 display", pace, panel)?;
-        mcu.assign_on(e_pin, oid, display)
+        let panel = Hd44780::claim(context, pace.clone(), pins, delay_ticks)?;
+        let display = Display::new(context, "HD44780 display", pace, panel)?;
+        context.assign_on(e_pin, oid, display)
     }
 );
 
 const HD44780_SEND_CMDS: Command = command!(
     "hd44780_send_cmds oid=%c cmds=%*s",
     Screen,
-    |display, turn, cmds: &[u8]| display.write(turn, Register::Commands, cmds)
+    |display, context, cmds: &[u8]| display.write(context, Register::Commands, cmds)
 );
 
 const HD44780_SEND_DATA: Command = command!(
     "hd44780_send_data oid=%c data=%*s",
     Screen,
-    |display, turn, data: &[u8]| display.write(turn, Register::Data, data)
+    |display, context, data: &[u8]| display.write(context, Register::Data, data)
 );

@@ -11,19 +11,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex};
-
-use crate::board::{Bias, Direction, Line, Mosi, OnWorker, Pin};
+use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
-    Settable, Slot, Turn, WorkerId, command, since,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Job, JobSlot, Oid, Remote, Settable, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
 
 use super::ready_adc::{Ready, ReadyAdc, ReadyChip, Sample};
-use lines::{Shift, Watcher};
-use spi::{Shared, Waves};
+use lines::{Shift, WatchReading, Watcher};
+use spi::Waves;
 
 mod lines;
 mod spi;
@@ -50,6 +48,8 @@ const ERROR_DESYNC: i32 = i32::MIN;
 const ERROR_READ_TOO_LONG: i32 = 1 << 30;
 
 const SAMPLE_BITS: u8 = 24;
+/// The first words of each warning.
+const SUBJECT: &str = "HX71x sclk";
 /// All of these chips share this worker.
 const WORKER: &str = "hx71x";
 /// Their watchers share this one.
@@ -73,65 +73,92 @@ struct Shifted {
     too_long: bool,
 }
 
-/// Reads a sample on a worker.
-enum Reading {
+/// The way to the chip, on a worker.
+enum Way {
     Lines(Shift),
     Spi(Waves),
 }
 
-impl Errand for Reading {
+impl Way {
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        match self {
+            Way::Lines(shift) => shift.warning.take(),
+            Way::Spi(waves) => waves.warning.take(),
+        }
+    }
+}
+
+/// Reads a sample.
+#[derive(Default)]
+struct Read {
+    warning: Option<DeviceWarning>,
+}
+
+impl Job for Read {
+    type Device = Way;
     /// `None`: no sample is ready.
-    type Answer = Option<Shifted>;
+    type Out = Option<Shifted>;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<Option<Shifted>, Shutdown> {
-        match self {
-            Reading::Lines(shift) => shift.run().map(Some),
-            Reading::Spi(waves) => waves.run(),
-        }
+    fn run(&mut self, way: &mut Way) -> Result<Option<Shifted>, Shutdown> {
+        let read = match way {
+            Way::Lines(shift) => shift.run().map(Some),
+            Way::Spi(waves) => waves.run(),
+        };
+        self.warning = way.take_warning();
+        read
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
 /// The clock line while no sample is shifted out. High switches the chip off.
-enum PowerDown {
-    Line(Arc<dyn Line>),
-    Spi(Shared),
-}
-
-impl Settable for PowerDown {
+impl Settable for Way {
     type Value = bool;
 
     fn set(&mut self, down: bool) -> Result<(), Shutdown> {
         match self {
-            PowerDown::Line(line) => line.write(down),
-            PowerDown::Spi(device) => spi::power_down(device, down),
+            Way::Lines(shift) => shift.power_down(down),
+            Way::Spi(waves) => waves.power_down(down),
         }
     }
 }
 
+// The numbers of the jobs; the reading has 0.
+const POWER_DOWN: u8 = 1;
+const WATCH: u8 = 2;
+
 struct Hx71x {
-    worker: WorkerId,
+    way: DeviceId<Way>,
     gain_channel: u8,
-    power_down: Remote<PowerDown>,
-    /// Watches the pulses of a reading, with its worker.
-    watcher: Option<(WorkerId, Slot<Watcher>)>,
+    power_down: Remote<Way>,
+    /// Watches the pulses of a reading, on its own worker.
+    watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>,
     /// Sent instead of samples until new measurements begin.
     last_error: Option<i32>,
 }
 
+impl Hx71x {
+    fn new(way: DeviceId<Way>, gain_channel: u8, watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>) -> Hx71x {
+        Hx71x { way, gain_channel, power_down: Remote::new(POWER_DOWN, way, true), watch, last_error: None }
+    }
+}
+
 impl ReadyChip for Hx71x {
     const NAME: &'static str = "HX71x";
-    type Reading = Reading;
+    type Reading = Read;
 
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
-        if let Some((worker, watcher)) = &mut self.watcher {
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Read>) -> Result<(), Shutdown> {
+        if let Some((watcher, watch)) = &mut self.watch {
             // After a reading without its last pulses it may still watch one of them.
-            if !watcher.is_here() {
+            if !watch.is_here() {
                 return Ok(());
             }
-            watcher.send(turn, *worker)?;
+            watch.send(context, *watcher)?;
         }
-        reading.send(turn, self.worker)
+        reading.send(context, self.way)
     }
 
     fn stop(failure: &Shutdown) -> Shutdown {
@@ -149,24 +176,27 @@ impl ReadyChip for Hx71x {
         Sample::Error { code: None, value: self.last_error.unwrap_or(ERROR_DESYNC) }
     }
 
-    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
         self.last_error = None;
-        self.power_down.set(turn, !on)
+        self.power_down.set(context, !on)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(Back { result, .. }) = self.watcher.as_mut().and_then(|(_, watcher)| watcher.back(done)) {
-            return result.or_else(|failure| turn.try_shut_down(failure.clone()));
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == POWER_DOWN {
+            return match self.power_down.back(context, finished) {
+                Some(Err(failure)) => context.try_shut_down(failure),
+                _ => Ok(()),
+            };
         }
-        match self.power_down.back(turn, done) {
-            Some(Err(failure)) => turn.try_shut_down(failure),
-            _ => Ok(()),
+        match self.watch.as_mut().and_then(|(_, watch)| watch.back(finished)) {
+            Some(Back { result, .. }) => result.or_else(|failure| context.try_shut_down(failure.clone())),
+            None => Ok(()),
         }
     }
 }
 
-fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
-    mcu.vacant(oid)?;
+fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
+    context.vacant(oid)?;
     if !(1..=4).contains(&gain_channel) {
         return Err(Shutdown::by_host(
             GAIN_RANGE,
@@ -174,47 +204,43 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         ));
     }
     let pulses = SAMPLE_BITS + gain_channel;
-    if let Some(mosi) = mcu.board()?.mosi_of(dout_pin) {
-        let (dout, sclk) = (mcu.name(dout_pin), mcu.name(sclk_pin));
+    if let Some(mosi) = context.board()?.mosi_of(dout_pin) {
+        let (dout, sclk) = (context.name(dout_pin), context.name(sclk_pin));
         if mosi != sclk_pin {
             let (remedy, cause) =
-                (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
+                (format!("write sclk_pin: {}", context.name(mosi)), format!("{dout} has another clock than {sclk}"));
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
         }
-        let Some(Mosi { line: OnWorker { bus, device }, .. }) = mcu.board()?.mosi(mosi, spi::RATE_HZ)? else {
+        let Some(Mosi { line: OnWorker { bus, device }, .. }) = context.board()?.mosi(mosi, spi::RATE_HZ)? else {
             let cause = format!("{sclk} is no data output of an SPI device");
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
         };
-        let worker = mcu.worker(&bus)?;
-        let device: Shared = Arc::new(Mutex::new(device));
-        let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);
-        let chip = Hx71x { worker, gain_channel, power_down, watcher: None, last_error: None };
-        let waves = Slot::new(Reading::Spi(Waves::new(device, pulses, sclk)));
-        return mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
+        let way = context.device(&bus, Box::new(Way::Spi(Waves::new(device, pulses, sclk))))?;
+        let chip = Hx71x::new(way, gain_channel, None);
+        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, Read::default()));
     }
-    let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
+    let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
-    let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
-    let worker = mcu.worker(WORKER)?;
+    let sclk = context.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
     // A call of the kernel takes about as long as a watcher waits.
-    let is_watched = sclk.is_fast() && mcu.has_parallel_workers();
-    let watcher = is_watched.then(|| Watcher::new(mcu, sclk.clone()));
-    let shift = Shift::new(mcu, sclk_pin, sclk.clone(), dout.clone(), pulses, watcher.as_ref());
-    let watcher = match watcher {
-        Some(watcher) => Some((mcu.worker(WATCHER)?, Slot::new(watcher))),
+    let is_watched = sclk.is_fast() && context.has_parallel_workers();
+    let watcher = is_watched.then(|| Watcher::new(context, sclk.clone()));
+    let shift = Shift::new(context, sclk_pin, sclk, dout.clone(), pulses, watcher.as_ref());
+    let way = context.device(WORKER, Box::new(Way::Lines(shift)))?;
+    let watch = match watcher {
+        Some(watcher) => Some((context.device(WATCHER, Box::new(watcher))?, JobSlot::numbered(WATCH, WatchReading))),
         None => None,
     };
-    let power_down = Remote::new(worker, PowerDown::Line(sclk), true);
-    let chip = Hx71x { worker, gain_channel, power_down, watcher, last_error: None };
-    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
+    let chip = Hx71x::new(way, gain_channel, watch);
+    context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Read::default()))
 }
 
 type Sensor = ReadyAdc<Hx71x>;
 
 const CONFIG_HX71X: Command = command!(
     "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u",
-    |mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
-        configure(mcu, oid, gain_channel, dout_pin, sclk_pin)
+    |context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
+        configure(context, oid, gain_channel, dout_pin, sclk_pin)
     }
 )
 .of(since(V0_13));
@@ -222,24 +248,25 @@ const CONFIG_HX71X: Command = command!(
 const HX71X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
-    |sensor, turn, trigger_analog_oid: Oid| { sensor.attached.attach(turn, trigger_analog_oid) }
+    |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
 .of(since(Master));
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
-    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
+    |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
-const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-    sensor.query(turn, rest_ticks)
-})
-.of(since(V0_13));
+const QUERY_HX71X: Command =
+    command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
+    })
+    .of(since(V0_13));
 
 const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", Sensor, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
+    command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

@@ -4,16 +4,16 @@
 //! `i2c_transfer` answers with the status of the bus, and klippy decides what to do. The older `i2c_read`, `i2c_write`
 //! and `i2c_modify_bits` have no status: a failure stops the MCU. A transfer is finished and answered before the next
 //! command runs, because klippy configures chips with one transfer after the other. A plain read is retried
-//! ([`BusDevice::read_register`]). A transfer that writes is not.
+//! ([`BusDevice::read_register`](crate::board::BusDevice::read_register)). A transfer that writes is not.
 
 #![forbid(unsafe_code)]
 
 use crate::board::soft_i2c::SoftI2c;
-use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, Pin, Range};
+use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{
-    Back, Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_11, Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Slot, Talk, Turn, command,
-    only, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_11, Generation::V0_12, Generation::V0_13, Job, JobSlot, Object, Oid, Response, command, only,
+    response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::Ticks;
@@ -93,8 +93,8 @@ fn statuses() -> Vec<Range> {
 }
 
 /// The shutdown for a sensor that cannot be reached (the firmware's `i2c_shutdown_on_err`).
-pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
-    let reason = if mcu.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
+pub(super) fn i2c_shutdown(context: &Context, error: BusError) -> Shutdown {
+    let reason = if context.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
     Shutdown::because(reason, error.trouble)
 }
 
@@ -146,10 +146,12 @@ impl Transfer {
     }
 }
 
-impl Talk for Transfer {
-    type Answer = ();
+impl Job for Transfer {
+    type Device = Chip;
+    type Out = ();
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         let read = &mut self.read[..self.read_len];
         match &self.write[..self.write_len] {
             [] if !read.is_empty() => chip.read_register(&[], read),
@@ -172,7 +174,7 @@ pub(super) struct I2c {
     bus: Option<Bus>,
     /// Whether the bus is a software bus on lines.
     on_lines: bool,
-    transfer: Slot<Conversation<Transfer>>,
+    transfer: JobSlot<Transfer>,
     /// Whether the last transfer failed. Only the first failure is logged: an unplugged display fails many times a
     /// second.
     failing: bool,
@@ -180,55 +182,55 @@ pub(super) struct I2c {
 
 impl I2c {
     fn new() -> I2c {
-        let transfer = Slot::talking(Transfer::new(Purpose::Transfer, &[], 0));
+        let transfer = JobSlot::new(Transfer::new(Purpose::Transfer, &[], 0));
         I2c { bus: None, on_lines: false, transfer, failing: false }
     }
 
-    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
+    fn set_bus(&mut self, context: &mut Context, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
         let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
-        let opened = mcu.board()?.i2c(config)?;
-        self.bus = Some(mcu.bus(opened)?);
+        let opened = context.board()?.i2c(config)?;
+        self.bus = Some(context.bus(opened)?);
         Ok(())
     }
 
-    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
+    fn set_lines(&mut self, context: &mut Context, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
         let [scl, sda] = pins;
-        let lines = (mcu.shared_wire(scl)?, mcu.shared_wire(sda)?);
-        let name = format!("scl {} sda {} address {:#04x}", mcu.name(scl), mcu.name(sda), seven_bits(address));
-        let device = SoftI2c::new(lines.0, lines.1, seven_bits(address), pulse, mcu.clock(), name);
-        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        let lines = (context.shared_wire(scl)?, context.shared_wire(sda)?);
+        let name = format!("scl {} sda {} address {:#04x}", context.name(scl), context.name(sda), seven_bits(address));
+        let device = SoftI2c::new(lines.0, lines.1, seven_bits(address), pulse, context.clock(), name);
+        self.bus = Some(context.software_bus(Box::new(device))?);
         self.on_lines = true;
         Ok(())
     }
 
     /// Starts a transfer for the running command.
-    fn transfer(&mut self, turn: &mut Turn, transfer: Transfer) -> Result<(), Shutdown> {
+    fn transfer(&mut self, context: &mut Context, transfer: Transfer) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // The firmware answers the same for a device without a bus.
             let status = BusStatus::Nack;
             if let Purpose::Transfer = transfer.purpose {
                 let i2c_bus_status = on_wire(status).0;
-                turn.send(TransferResponse { oid: turn.oid(), i2c_bus_status, response: transfer.response() });
+                context.send(TransferResponse { oid: context.oid(), i2c_bus_status, response: transfer.response() });
                 return Ok(());
             }
             let error = BusError::new(status, "it has no bus: a fault of the host, which did not send i2c_set_bus");
-            return Err(self.failure(turn, matches!(transfer.purpose, Purpose::Write), error));
+            return Err(self.failure(context, matches!(transfer.purpose, Purpose::Write), error));
         };
-        // Commands wait for each other, so the conversation is here.
-        let Some(conversation) = self.transfer.here() else {
+        // Commands wait for each other, so the job is here.
+        let Some(present) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
-        conversation.talk = transfer;
-        self.transfer.converse_on(turn, bus)
+        *present = transfer;
+        self.transfer.send(context, bus.chip())
     }
 
     /// The shutdown for a failed transfer, depending on whether it was writing or reading.
-    fn failure(&self, mcu: &Mcu, writing: bool, error: BusError) -> Shutdown {
+    fn failure(&self, context: &Context, writing: bool, error: BusError) -> Shutdown {
         match writing {
-            _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
+            _ if !context.serves(until(V0_12)) => i2c_shutdown(context, error),
             _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.trouble),
             true => Shutdown::because(I2C_WRITE_FAILED, error.trouble),
-            false => i2c_shutdown(mcu, error),
+            false => i2c_shutdown(context, error),
         }
     }
 }
@@ -239,34 +241,34 @@ impl Object for I2c {
     }
 
     /// Reports the result of a transfer to the host. If the answer has no status, a failure stops the MCU.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.transfer.back(finished) else { return Ok(()) };
         let result = result.map_err(BusError::clone);
-        let Some(Conversation { talk: transfer, .. }) = self.transfer.here() else { return Ok(()) };
+        let Some(transfer) = self.transfer.here() else { return Ok(()) };
         let response = transfer.response();
         match (transfer.purpose, &result) {
             (Purpose::Transfer, result) => {
                 let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
-                turn.send(TransferResponse { oid: turn.oid(), i2c_bus_status, response });
+                context.send(TransferResponse { oid: context.oid(), i2c_bus_status, response });
             }
-            (Purpose::Read, Ok(())) => turn.send(ReadResponse { oid: turn.oid(), response }),
+            (Purpose::Read, Ok(())) => context.send(ReadResponse { oid: context.oid(), response }),
             _ => {}
         }
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         let Err(error) = result else { return Ok(()) };
         if let Purpose::Transfer = transfer.purpose {
             if !failed_before {
-                let trouble = i2c_shutdown(turn, error);
-                turn.warn(self.kind(), trouble);
+                let trouble = i2c_shutdown(context, error);
+                context.warn(self.kind(), trouble);
             }
             return Ok(());
         }
         // v0.11 wrote the register in a transfer of its own before the read.
         let of_register =
-            turn.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
+            context.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
         let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
-        let failure = self.failure(turn, writing, error);
-        turn.device_failed(self.kind(), failure)
+        let failure = self.failure(context, writing, error);
+        context.device_failed(self.kind(), failure)
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -274,15 +276,16 @@ impl Object for I2c {
     }
 }
 
-const CONFIG_I2C: Command = command!("config_i2c oid=%c", |mcu, oid: Oid| mcu.assign(oid, I2c::new())).of(since(V0_12));
+const CONFIG_I2C: Command =
+    command!("config_i2c oid=%c", |context, oid: Oid| context.assign(oid, I2c::new())).of(since(V0_12));
 
 const CONFIG_I2C_WITH_BUS: Command = command!(
     "config_i2c oid=%c i2c_bus=%u rate=%u address=%u",
-    |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
-        mcu.vacant(oid)?;
+    |context, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
+        context.vacant(oid)?;
         let mut i2c = I2c::new();
-        i2c.set_bus(mcu, i2c_bus, rate, address)?;
-        mcu.assign(oid, i2c)
+        i2c.set_bus(context, i2c_bus, rate, address)?;
+        context.assign(oid, i2c)
     }
 )
 .of(only(V0_11));
@@ -290,7 +293,7 @@ const CONFIG_I2C_WITH_BUS: Command = command!(
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
     I2c,
-    |i2c, turn, i2c_bus: u32, rate: u32, address: u32| i2c.set_bus(turn, i2c_bus, rate, address)
+    |i2c, context, i2c_bus: u32, rate: u32, address: u32| i2c.set_bus(context, i2c_bus, rate, address)
 )
 .of(since(V0_12));
 
@@ -300,9 +303,9 @@ const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
 const I2C_SET_SOFTWARE_BUS: Command = command!(
     "i2c_set_software_bus oid=%c scl_pin=%u sda_pin=%u rate=%u address=%u",
     I2c,
-    |i2c, turn, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
+    |i2c, context, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
         let _ = rate;
-        i2c.set_lines(turn, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
+        i2c.set_lines(context, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
     }
 )
 .of(since(V0_12).until(V0_13));
@@ -310,8 +313,8 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
     I2c,
-    |i2c, turn, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| i2c.set_lines(
-        turn,
+    |i2c, context, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| i2c.set_lines(
+        context,
         [scl_pin, sda_pin],
         pulse_ticks,
         address
@@ -319,33 +322,33 @@ const I2C_SET_SW_BUS: Command = command!(
 )
 .of(since(Master).and(Kalico));
 
-const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", I2c, |i2c, turn, data: &[u8]| i2c
-    .transfer(turn, Transfer::new(Purpose::Write, data, 0)))
+const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", I2c, |i2c, context, data: &[u8]| i2c
+    .transfer(context, Transfer::new(Purpose::Write, data, 0)))
 .of(until(V0_13).and(Kalico));
 
 const I2C_READ: Command =
-    command!("i2c_read oid=%c reg=%*s read_len=%u", I2c, |i2c, turn, reg: &[u8], read_len: u32| i2c
-        .transfer(turn, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
+    command!("i2c_read oid=%c reg=%*s read_len=%u", I2c, |i2c, context, reg: &[u8], read_len: u32| i2c
+        .transfer(context, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
     .of(until(V0_13).and(Kalico));
 
 const I2C_MODIFY_BITS: Command = command!(
     "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
     I2c,
-    |i2c, turn, reg: &[u8], clear_set_bits: &[u8]| {
+    |i2c, context, reg: &[u8], clear_set_bits: &[u8]| {
         if clear_set_bits.len() % 2 != 0 {
             let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
             return Err(Shutdown::by_host(ODD_BITS, what));
         }
 
         let purpose = Purpose::modify(clear_set_bits);
-        i2c.transfer(turn, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
+        i2c.transfer(context, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
     }
 )
 .of(until(V0_12));
 
 const I2C_TRANSFER: Command =
-    command!("i2c_transfer oid=%c write=%*s read_len=%u", I2c, |i2c, turn, write: &[u8], read_len: u32| {
-        i2c.transfer(turn, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
+    command!("i2c_transfer oid=%c write=%*s read_len=%u", I2c, |i2c, context, write: &[u8], read_len: u32| {
+        i2c.transfer(context, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
     })
     .of(since(Master));
 

@@ -12,8 +12,9 @@ use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
 use crate::mcu::{
-    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
-    Generations, Mcu, Next, Object, Oid, Response, Slot, Talk, Timer, Turn, WireClock, command, only, response, since,
+    Back, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Generations, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only,
+    response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -104,11 +105,13 @@ struct Look {
     error: u8,
 }
 
-impl Talk for Look {
+impl Job for Look {
+    type Device = Chip;
     /// Both words of channel 0.
-    type Answer = Option<u32>;
+    type Out = Option<u32>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<u32>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Option<u32>, BusError> {
         self.error = I2C_STATUS_ERROR;
         if !is_ready(chip)? {
             return Ok(None);
@@ -123,10 +126,12 @@ impl Talk for Look {
 /// Asks whether there is a sample.
 struct Ask;
 
-impl Talk for Ask {
-    type Answer = bool;
+impl Job for Ask {
+    type Device = Chip;
+    type Out = bool;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<bool, BusError> {
         is_ready(chip)
     }
 }
@@ -151,7 +156,7 @@ impl Homing {
         Homing { trsync: None, threshold: 0, trigger_reason: 0, error_reason: 0, awaits: false, clock: Clock::EPOCH };
 
     /// Processes both words of channel 0, read at `at`.
-    fn update(&mut self, mcu: &mut Mcu, words: u32, at: Clock) -> Result<(), Shutdown> {
+    fn update(&mut self, context: &mut Context, words: u32, at: Clock) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
         let reason = if words > DATA {
             self.error_reason
@@ -165,80 +170,84 @@ impl Homing {
             return Ok(());
         };
         self.trsync = None;
-        mcu.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, reason))
+        context.with::<Trsync, _>(trsync, |trsync, context| trsync.trigger(context, reason))
     }
 }
 
 const KIND: &str = "LDC1612";
 
+// The numbers of the jobs.
+const LOOK: u8 = 0;
+const ASK: u8 = 1;
+
 struct Ldc1612 {
     i2c: Oid,
     /// Low while a sample is ready.
     intb: Option<Arc<dyn Line>>,
-    look: Slot<Conversation<Look>>,
+    look: JobSlot<Look>,
     /// Turns of the timer that came during a reading.
     missed: u16,
-    ask: Slot<Conversation<Ask>>,
+    ask: JobSlot<Ask>,
     rest_ticks: Ticks,
     bulk: SensorBulk,
     attached: Attached,
     homing: Homing,
-    /// Whether the last conversation failed. Only the first failure is logged.
+    /// Whether the last job failed. Only the first failure is logged.
     failing: bool,
 }
 
 impl Ldc1612 {
-    fn configure(mcu: &mut Mcu, oid: Oid, i2c: Oid, intb_pin: Option<Pin>) -> Result<(), Shutdown> {
-        mcu.vacant(oid)?;
-        mcu.require::<I2c>(i2c)?;
-        let intb = intb_pin.map(|pin| mcu.prompt_line(pin, "intb", Direction::Input(Bias::PullUp))).transpose()?;
+    fn configure(context: &mut Context, oid: Oid, i2c: Oid, intb_pin: Option<Pin>) -> Result<(), Shutdown> {
+        context.vacant(oid)?;
+        context.require::<I2c>(i2c)?;
+        let intb = intb_pin.map(|pin| context.prompt_line(pin, "intb", Direction::Input(Bias::PullUp))).transpose()?;
         let sensor = Ldc1612 {
             i2c,
             intb,
-            look: Slot::talking(Look { error: I2C_STATUS_ERROR }),
+            look: JobSlot::numbered(LOOK, Look { error: I2C_STATUS_ERROR }),
             missed: 0,
-            ask: Slot::talking(Ask),
+            ask: JobSlot::numbered(ASK, Ask),
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
             attached: Attached::default(),
             homing: Homing::OFF,
             failing: false,
         };
-        mcu.assign(oid, sensor)
+        context.assign(oid, sensor)
     }
 
-    /// Logs a failure of the bus if the conversation before did not fail, or stops the MCU.
-    fn note(failing: &mut bool, turn: &mut Turn, failure: Option<&BusError>) -> Result<(), Shutdown> {
+    /// Logs a failure of the bus if the job before did not fail, or stops the MCU.
+    fn note(failing: &mut bool, context: &mut Context, failure: Option<&BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(failing, failure.is_some());
         let Some(error) = failure else { return Ok(()) };
-        let stops = turn.serves(HOMES_ITSELF);
+        let stops = context.serves(HOMES_ITSELF);
         if failed_before && !stops {
             return Ok(());
         }
-        let trouble = i2c_shutdown(turn, error.clone());
+        let trouble = i2c_shutdown(context, error.clone());
         if stops {
-            return turn.device_failed(KIND, trouble);
+            return context.device_failed(KIND, trouble);
         }
-        turn.warn(KIND, trouble);
+        context.warn(KIND, trouble);
         Ok(())
     }
 
     /// Makes the worker read the sensor, if it may have a sample.
-    fn look(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn look(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
             return Ok(());
         }
-        self.look.converse(turn, self.i2c)
+        self.look.send_to(context, self.i2c)
     }
 
     /// Makes up for the turns that came while the sensor was read. The firmware's timer waits for the bus. So the first
     /// of these turns runs now, and each further one counts as possibly lost samples.
-    fn make_up(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn make_up(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let missed = std::mem::take(&mut self.missed);
         if missed == 0 {
             return Ok(());
         }
-        self.look(turn)?;
+        self.look(context)?;
         if self.look.is_pending() {
             self.bulk.count_overflows(missed - 1);
         }
@@ -246,37 +255,37 @@ impl Ldc1612 {
     }
 
     /// Processes a sample: both words of channel 0, or an error.
-    fn add(&mut self, turn: &mut Turn, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
+    fn add(&mut self, context: &mut Context, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
         let sample = match words {
-            Ok(words) if looks_like_an_error(words) && !turn.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
+            Ok(words) if looks_like_an_error(words) && !context.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
             words => words,
         };
         let sample = match sample {
             Err(error) => {
-                self.attached.note_error(turn, error)?;
+                self.attached.note_error(context, error)?;
                 [0xff, 0xff, 0, error]
             }
             Ok(words) => {
                 match words & ERROR_FLAGS {
-                    0 => self.attached.update(turn, (words & DATA) as i32, read_at)?,
-                    _ => self.attached.note_error(turn, SENSOR_REPORTS_ERROR)?,
+                    0 => self.attached.update(context, (words & DATA) as i32, read_at)?,
+                    _ => self.attached.note_error(context, SENSOR_REPORTS_ERROR)?,
                 }
-                self.homing.update(turn, words, read_at)?;
+                self.homing.update(context, words, read_at)?;
                 words.to_be_bytes()
             }
         };
-        self.bulk.add(turn, &sample);
+        self.bulk.add(context, &sample);
         Ok(())
     }
 
-    fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn query_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let Some(intb) = &self.intb else {
-            return self.ask.converse(turn, self.i2c);
+            return self.ask.send_to(context, self.i2c);
         };
-        let now = turn.now();
+        let now = context.now();
         // A sample that is being read counts as one in the chip.
         let ready = self.look.is_pending() || !intb.read()?;
-        self.bulk.send_status(turn, (now, now), if ready { SAMPLE_BYTES } else { 0 });
+        self.bulk.send_status(context, (now, now), if ready { SAMPLE_BYTES } else { 0 });
         Ok(())
     }
 }
@@ -286,70 +295,71 @@ impl Object for Ldc1612 {
         KIND
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if self.look.is_here() {
-            self.look(turn)?;
+            self.look(context)?;
         } else {
             self.missed = self.missed.saturating_add(1);
         }
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        if let Some(Back { result, counts, ended, .. }) = self.look.back(done) {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number == LOOK {
+            let Some(Back { result, is_wanted, ended, .. }) = self.look.back(finished) else { return Ok(()) };
             let read = result.ok();
-            Self::note(&mut self.failing, turn, result.err())?;
+            Self::note(&mut self.failing, context, result.err())?;
             let words = match read {
                 Some(words) => words.map(Ok),
-                None => self.look.here().map(|look| Err(look.talk.error)),
+                None => self.look.here().map(|look| Err(look.error)),
             };
-            if let (true, Some(words)) = (counts, words) {
-                self.add(turn, words, ended)?;
+            if let (true, Some(words)) = (is_wanted, words) {
+                self.add(context, words, ended)?;
             }
-            return self.make_up(turn);
+            return self.make_up(context);
         }
         // If there is no answer, klippy asks again.
-        let Some(Back { result, began, ended, .. }) = self.ask.back(done) else { return Ok(()) };
+        let Some(Back { result, began, ended, .. }) = self.ask.back(finished) else { return Ok(()) };
         if let Ok(ready) = result {
-            self.bulk.send_status(turn, (began, ended), if ready { SAMPLE_BYTES } else { 0 });
+            self.bulk.send_status(context, (began, ended), if ready { SAMPLE_BYTES } else { 0 });
         }
-        Self::note(&mut self.failing, turn, result.err())
+        Self::note(&mut self.failing, context, result.err())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.look.drop_pending();
         self.missed = 0;
     }
 }
 
-const CONFIG_LDC1612: Command = command!("config_ldc1612 oid=%c i2c_oid=%c", |mcu, oid: Oid, i2c_oid: Oid| {
-    Ldc1612::configure(mcu, oid, i2c_oid, None)
+const CONFIG_LDC1612: Command = command!("config_ldc1612 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
+    Ldc1612::configure(context, oid, i2c_oid, None)
 })
 .of(since(V0_13));
 
-const CONFIG_LDC1612_WITH_INTB: Command =
-    command!("config_ldc1612_with_intb oid=%c i2c_oid=%c intb_pin=%c", |mcu, oid: Oid, i2c_oid: Oid, intb_pin: Pin| {
-        Ldc1612::configure(mcu, oid, i2c_oid, Some(intb_pin))
-    })
-    .of(since(V0_13));
+const CONFIG_LDC1612_WITH_INTB: Command = command!(
+    "config_ldc1612_with_intb oid=%c i2c_oid=%c intb_pin=%c",
+    |context, oid: Oid, i2c_oid: Oid, intb_pin: Pin| { Ldc1612::configure(context, oid, i2c_oid, Some(intb_pin)) }
+)
+.of(since(V0_13));
 
 const LDC1612_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Ldc1612,
-    |sensor, turn, trigger_analog_oid: Oid| sensor.attached.attach(turn, trigger_analog_oid)
+    |sensor, context, trigger_analog_oid: Oid| sensor.attached.attach(context, trigger_analog_oid)
 )
 .of(since(Master));
 
 const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
     Ldc1612,
-    |sensor, turn, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
-        let clock = turn.instant(clock);
+    |sensor, context, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
+        let clock = context.instant(clock);
         if threshold == 0 {
             sensor.homing.trsync = None;
             return Ok(());
         }
-        turn.require::<Trsync>(trsync_oid)?;
+        context.require::<Trsync>(trsync_oid)?;
         let trsync = Some(trsync_oid);
         sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
         Ok(())
@@ -357,16 +367,16 @@ const LDC1612_SETUP_HOME: Command = command!(
 )
 .of(HOMES_ITSELF);
 
-const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", Ldc1612, |sensor, turn| {
+const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", Ldc1612, |sensor, context| {
     let homing = &sensor.homing;
-    turn.send(HomeState { oid: turn.oid(), homing: homing.trsync.is_some(), trigger_clock: homing.clock });
+    context.send(HomeState { oid: context.oid(), homing: homing.trsync.is_some(), trigger_clock: homing.clock });
     Ok(())
 })
 .of(HOMES_ITSELF);
 
 const QUERY_LDC1612: Command =
-    command!("query_ldc1612 oid=%c rest_ticks=%u", Ldc1612, |sensor, turn, rest_ticks: Ticks| {
-        turn.cancel(TIMER);
+    command!("query_ldc1612 oid=%c rest_ticks=%u", Ldc1612, |sensor, context, rest_ticks: Ticks| {
+        context.cancel(TIMER);
         sensor.look.drop_pending();
         sensor.missed = 0;
         if rest_ticks == Ticks(0) {
@@ -374,13 +384,13 @@ const QUERY_LDC1612: Command =
         }
         sensor.rest_ticks = rest_ticks;
         sensor.bulk.reset();
-        let at = turn.now() + rest_ticks;
-        turn.schedule(TIMER, at)
+        let at = context.now() + rest_ticks;
+        context.schedule(TIMER, at)
     })
     .of(since(V0_13));
 
 const QUERY_STATUS_LDC1612: Command =
-    command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
+    command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor.query_status(context)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

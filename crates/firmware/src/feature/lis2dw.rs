@@ -138,16 +138,16 @@ impl FifoChip for Lis2dw {
 
 type Sensor = FifoSensor<Lis2dw>;
 
-const CONFIG_LIS2DW_ON_SPI: Command = command!("config_lis2dw oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
-    configure(mcu, oid, spi_oid, Lis2dw { bus_type: BusType::Spi, model: Model::Lis2dw })
+const CONFIG_LIS2DW_ON_SPI: Command = command!("config_lis2dw oid=%c spi_oid=%c", |context, oid: Oid, spi_oid: Oid| {
+    configure(context, oid, spi_oid, Lis2dw { bus_type: BusType::Spi, model: Model::Lis2dw })
 })
 .of(only(V0_12));
 
 const CONFIG_LIS2DW: Command = command!(
     "config_lis2dw oid=%c bus_oid=%c bus_oid_type=%c lis_chip_type=%c",
-    |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8, lis_chip_type: u8| {
+    |context, oid: Oid, bus_oid: Oid, bus_oid_type: u8, lis_chip_type: u8| {
         let chip = Lis2dw { bus_type: BusType::of(bus_oid_type)?, model: Model::of(lis_chip_type)? };
-        configure(mcu, oid, bus_oid, chip)
+        configure(context, oid, bus_oid, chip)
     }
 )
 .of(since(V0_13));
@@ -155,18 +155,18 @@ const CONFIG_LIS2DW: Command = command!(
 const QUERY_LIS2DW_AT: Command = command!(
     "query_lis2dw oid=%c clock=%u rest_ticks=%u",
     Sensor,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(turn, clock, rest_ticks) }
+    |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
 .of(only(V0_12));
 
 const QUERY_LIS2DW: Command =
-    command!("query_lis2dw oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_lis2dw oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(V0_13));
 
 const QUERY_LIS2DW_STATUS: Command =
-    command!("query_lis2dw_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn)).of(since(V0_12));
+    command!("query_lis2dw_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context)).of(since(V0_12));
 
 #[cfg(test)]
 mod tests {

@@ -6,7 +6,7 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response,
+    Command, Context, Feature, Generation::Kalico, Next, Object, Oid, Response, Timer, WireClock, command, response,
     since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -96,7 +96,7 @@ pub(super) struct LoadCellProbe {
 
 impl LoadCellProbe {
     /// Processes a sample of the sensor, read at `at`.
-    pub(super) fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+    pub(super) fn update(&mut self, context: &mut Context, sample: i32, at: Clock) -> Result<(), Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(()) };
         homing.watchdog_count = 0;
         if homing.awaits && at < homing.begin {
@@ -105,26 +105,26 @@ impl LoadCellProbe {
         homing.awaits = false;
         // The safe range does not include its ends.
         if sample <= self.limits.counts_min || sample >= self.limits.counts_max {
-            return homing.fail(mcu, SAFETY_RANGE);
+            return homing.fail(context, SAFETY_RANGE);
         }
-        let Some(grams) = self.limits.grams(sample) else { return homing.fail(mcu, OVERFLOW) };
-        let filtered = mcu.with::<SosFilter, _>(self.filter, |filter, _| filter.apply_scaled(grams))?;
+        let Some(grams) = self.limits.grams(sample) else { return homing.fail(context, OVERFLOW) };
+        let filtered = context.with::<SosFilter, _>(self.filter, |filter, _| filter.apply_scaled(grams))?;
         // The first trigger counts. Samples are still checked until the host ends that.
         if filtered.wrapping_abs() < self.limits.trigger_grams || self.triggered.is_some() {
             return Ok(());
         }
         self.triggered = Some(at);
-        homing.pull(mcu, homing.trigger_reason)
+        homing.pull(context, homing.trigger_reason)
     }
 }
 
 impl Homing {
-    fn fail(&self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
-        self.pull(mcu, self.error_reason.wrapping_add(error))
+    fn fail(&self, context: &mut Context, error: u8) -> Result<(), Shutdown> {
+        self.pull(context, self.error_reason.wrapping_add(error))
     }
 
-    fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
-        mcu.with::<Trsync, _>(self.trsync, |trsync, turn| trsync.trigger(turn, reason))
+    fn pull(&self, context: &mut Context, reason: u8) -> Result<(), Shutdown> {
+        context.with::<Trsync, _>(self.trsync, |trsync, context| trsync.trigger(context, reason))
     }
 }
 
@@ -134,10 +134,10 @@ impl Object for LoadCellProbe {
     }
 
     /// Checks whether the sensor is silent.
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = self.homing.as_mut().filter(|_| self.triggered.is_none()) else { return Ok(Next::Done) };
         if homing.watchdog_count > homing.watchdog_max {
-            homing.fail(turn, WATCHDOG)?;
+            homing.fail(context, WATCHDOG)?;
         }
         homing.watchdog_count = homing.watchdog_count.wrapping_add(1);
         Ok(Next::At(at + homing.rest_ticks))
@@ -145,10 +145,10 @@ impl Object for LoadCellProbe {
 }
 
 const CONFIG_LOAD_CELL_PROBE: Command =
-    command!("config_load_cell_probe oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
-        mcu.require::<SosFilter>(sos_filter_oid)?;
+    command!("config_load_cell_probe oid=%c sos_filter_oid=%c", |context, oid: Oid, sos_filter_oid: Oid| {
+        context.require::<SosFilter>(sos_filter_oid)?;
         let limits = Limits::default();
-        mcu.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
+        context.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
     })
     .of(since(Kalico));
 
@@ -188,21 +188,21 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
     "load_cell_probe_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u rest_ticks=%u timeout=%u",
     LoadCellProbe,
     |probe,
-     turn,
+     context,
      trsync_oid: Oid,
      trigger_reason: u8,
      error_reason: u8,
      clock: WireClock,
      rest_ticks: Ticks,
      timeout: u32| {
-        let begin = turn.instant(clock);
-        turn.cancel(TIMER);
+        let begin = context.instant(clock);
+        context.cancel(TIMER);
         (probe.homing, probe.triggered) = (None, None);
         // The host ends probing this way.
         if error_reason == 0 {
             return Ok(());
         }
-        turn.require::<Trsync>(trsync_oid)?;
+        context.require::<Trsync>(trsync_oid)?;
         probe.homing = Some(Homing {
             trsync: trsync_oid,
             trigger_reason,
@@ -214,15 +214,15 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
             watchdog_max: timeout as u8,
             watchdog_count: 0,
         });
-        turn.schedule(TIMER, begin)
+        context.schedule(TIMER, begin)
     }
 )
 .of(since(Kalico));
 
 const LOAD_CELL_PROBE_QUERY_STATE: Command =
-    command!("load_cell_probe_query_state oid=%c", LoadCellProbe, |probe, turn| {
+    command!("load_cell_probe_query_state oid=%c", LoadCellProbe, |probe, context| {
         let trigger_ticks = probe.triggered.map_or(0, Clock::wire);
-        turn.send(State { oid: turn.oid(), is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
+        context.send(State { oid: context.oid(), is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
         Ok(())
     })
     .of(since(Kalico));

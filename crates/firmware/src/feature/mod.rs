@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{Bias, Pin, Range};
-use crate::mcu::{Feature, Mcu, base, place_of_response};
+use crate::mcu::{Context, Feature, base, place_of_response};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 
@@ -124,7 +124,7 @@ fn changes_too_late(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
 
 /// The shutdown for a `set_digital_out` or `set_pwm_out` that names a new pin after `finalize_config`.
 #[cold]
-fn set_too_late(mcu: &Mcu, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
-    let name = mcu.name(pin);
+fn set_too_late(context: &Context, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
+    let name = context.name(pin);
     Shutdown::by_host(reason, format_args!("{command} wants {name} after finalize_config, and did not set it before"))
 }

@@ -130,38 +130,39 @@ impl<M: Mpu> FifoChip for M {
 
 type Mpu9250Sensor = FifoSensor<Mpu9250>;
 
-const CONFIG_MPU9250: Command = command!("config_mpu9250 oid=%c i2c_oid=%c", |mcu, oid: Oid, i2c_oid: Oid| {
-    configure(mcu, oid, i2c_oid, Mpu9250)
+const CONFIG_MPU9250: Command = command!("config_mpu9250 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
+    configure(context, oid, i2c_oid, Mpu9250)
 });
 
 const QUERY_MPU9250_AT: Command = command!(
     "query_mpu9250 oid=%c clock=%u rest_ticks=%u",
     Mpu9250Sensor,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(turn, clock, rest_ticks) }
+    |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
 .of(until(V0_12));
 
 const QUERY_MPU9250: Command =
-    command!("query_mpu9250 oid=%c rest_ticks=%u", Mpu9250Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_mpu9250 oid=%c rest_ticks=%u", Mpu9250Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(V0_13));
 
 const QUERY_MPU9250_STATUS: Command =
-    command!("query_mpu9250_status oid=%c", Mpu9250Sensor, |sensor, turn| sensor.ask_status(turn));
+    command!("query_mpu9250_status oid=%c", Mpu9250Sensor, |sensor, context| sensor.ask_status(context));
 
 type Icm20948Sensor = FifoSensor<Icm20948>;
 
-const CONFIG_ICM20948: Command = command!("config_icm20948 oid=%c i2c_oid=%c", |mcu, oid: Oid, i2c_oid: Oid| {
-    configure(mcu, oid, i2c_oid, Icm20948)
+const CONFIG_ICM20948: Command = command!("config_icm20948 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
+    configure(context, oid, i2c_oid, Icm20948)
 })
 .of(since(V0_13));
 
 const QUERY_ICM20948: Command =
-    command!("query_icm20948 oid=%c rest_ticks=%u", Icm20948Sensor, |sensor, turn, rest_ticks: Ticks| {
-        sensor.query(turn, rest_ticks)
+    command!("query_icm20948 oid=%c rest_ticks=%u", Icm20948Sensor, |sensor, context, rest_ticks: Ticks| {
+        sensor.query(context, rest_ticks)
     })
     .of(since(V0_13));
 
 const QUERY_ICM20948_STATUS: Command =
-    command!("query_icm20948_status oid=%c", Icm20948Sensor, |sensor, turn| sensor.ask_status(turn)).of(since(V0_13));
+    command!("query_icm20948_status oid=%c", Icm20948Sensor, |sensor, context| sensor.ask_status(context))
+        .of(since(V0_13));

@@ -9,7 +9,8 @@
 
 use crate::board::{Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, Mcu, Object, Oid, Response, Slot, Turn, WorkerId, command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Object, Oid, Response, command,
+    response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -55,26 +56,35 @@ enum Way {
 /// Sends the chain's colors.
 struct Frame {
     data: Vec<u8>,
-    way: Way,
+    warning: Option<DeviceWarning>,
 }
 
-impl Errand for Frame {
+impl Job for Frame {
+    type Device = Way;
     /// Whether the pulses had their times.
-    type Answer = bool;
+    type Out = bool;
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<bool, Shutdown> {
-        match &mut self.way {
+    fn run(&mut self, way: &mut Way) -> Result<bool, Shutdown> {
+        match way {
             Way::Spi(waves) => waves.send(&self.data).map(|()| true),
-            Way::Line(pulses) => pulses.send(&self.data),
+            Way::Line(pulses) => {
+                let sent = pulses.send(&self.data);
+                self.warning = pulses.warning.take();
+                sent
+            }
         }
+    }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
     }
 }
 
 struct Neopixel {
-    worker: WorkerId,
+    way: DeviceId<Way>,
     data: Vec<u8>,
-    frame: Slot<Frame>,
+    frame: JobSlot<Frame>,
     /// Whether the log already has a line about failed sending.
     failing: bool,
 }
@@ -92,13 +102,13 @@ impl Neopixel {
         Ok(())
     }
 
-    fn send(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn send(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         // Commands wait for each other, so the frame is here.
         let Some(frame) = self.frame.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
         };
         frame.data.copy_from_slice(&self.data);
-        self.frame.send(turn, self.worker)
+        self.frame.send(context, self.way)
     }
 }
 
@@ -107,44 +117,45 @@ impl Object for Neopixel {
         "neopixel"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.frame.back(done) else { return Ok(()) };
-        turn.send(Sent { oid: turn.oid(), success: result == Ok(true) });
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.frame.back(finished) else { return Ok(()) };
+        context.send(Sent { oid: context.oid(), success: result == Ok(true) });
         // No color is worth a print. klippy tries eight times for each change, so only the first failure is logged.
         let known = std::mem::replace(&mut self.failing, result.is_err());
         if let (Err(error), false) = (result, known) {
             let trouble = error.clone();
-            turn.warn(self.kind(), trouble);
+            context.warn(self.kind(), trouble);
         }
         Ok(())
     }
 }
 
-/// The way to the LEDs at a pin, and its worker.
-fn way(mcu: &mut Mcu, pin: Pin, size: usize, bit_max: Ticks, reset: Ticks) -> Result<(WorkerId, Way), Shutdown> {
-    let Some(mosi) = mcu.board()?.mosi(pin, spi::RATE_HZ)? else {
-        let line = mcu.prompt_line(pin, "LED", Direction::Output { level: false, shutdown_value: false })?;
-        return Ok((mcu.worker(line::WORKER)?, Way::Line(Pulses::new(mcu, pin, line, size, bit_max, reset)?)));
+/// The way to the LEDs at a pin.
+fn way(context: &mut Context, pin: Pin, size: usize, bit_max: Ticks, reset: Ticks) -> Result<DeviceId<Way>, Shutdown> {
+    let Some(mosi) = context.board()?.mosi(pin, spi::RATE_HZ)? else {
+        let line = context.prompt_line(pin, "LED", Direction::Output { level: false, shutdown_value: false })?;
+        let pulses = Pulses::new(context, pin, line, size, bit_max, reset)?;
+        return context.device(line::WORKER, Box::new(Way::Line(pulses)));
     };
     let Mosi { line: OnWorker { bus, device }, message_max, pauses } = mosi;
-    let waves = Waves::new(device, size, reset, message_max).map_err(|error| error.of(&mcu.name(pin)))?;
+    let waves = Waves::new(device, size, reset, message_max).map_err(|error| error.of(&context.name(pin)))?;
     if let Some(trouble) = pauses {
-        log::warn!("{trouble}");
+        context.warn_of_device(&DeviceWarning::new("", trouble));
     }
-    Ok((mcu.worker(&bus)?, Way::Spi(waves)))
+    context.device(&bus, Box::new(Way::Spi(waves)))
 }
 
 const CONFIG_NEOPIXEL: Command = command!(
     "config_neopixel oid=%c pin=%u data_size=%hu bit_max_ticks=%u reset_min_ticks=%u",
-    |mcu, oid: Oid, pin: Pin, data_size: u16, bit_max_ticks: Ticks, reset_min_ticks: Ticks| {
-        mcu.vacant(oid)?;
+    |context, oid: Oid, pin: Pin, data_size: u16, bit_max_ticks: Ticks, reset_min_ticks: Ticks| {
+        context.vacant(oid)?;
         if data_size >= SIZE_LIMIT {
             return Err(Shutdown::by_host(INVALID_SIZE, format_args!("a chain of {data_size} bytes")));
         }
         let size = usize::from(data_size);
-        let (worker, way) = way(mcu, pin, size, bit_max_ticks, reset_min_ticks.max(RESET_MIN))?;
-        let frame = Slot::new(Frame { data: vec![0; size], way });
-        mcu.assign_on(pin, oid, Neopixel { worker, data: vec![0; size], frame, failing: false })
+        let way = way(context, pin, size, bit_max_ticks, reset_min_ticks.max(RESET_MIN))?;
+        let frame = JobSlot::new(Frame { data: vec![0; size], warning: None });
+        context.assign_on(pin, oid, Neopixel { way, data: vec![0; size], frame, failing: false })
     }
 );
 
@@ -152,4 +163,4 @@ const NEOPIXEL_UPDATE: Command =
     command!("neopixel_update oid=%c pos=%hu data=%*s", Neopixel, |chain, _, pos: u16, data: &[u8]| chain
         .update(pos, data));
 
-const NEOPIXEL_SEND: Command = command!("neopixel_send oid=%c", Neopixel, |chain, turn| chain.send(turn));
+const NEOPIXEL_SEND: Command = command!("neopixel_send oid=%c", Neopixel, |chain, context| chain.send(context));

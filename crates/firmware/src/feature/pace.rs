@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The time of an errand that drives lines itself, with a few microseconds between two edges.
+//! The time of a job that drives lines itself, with a few microseconds between two edges.
 //!
 //! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here. Meanwhile the core
 //! is free, and nothing has to wake up between two edges.
@@ -9,7 +9,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::mcu::Mcu;
+use crate::mcu::Context;
 use crate::time::{Clock, Ticks, TimeSource};
 
 /// Longest time that a wait continues after a stop.
@@ -28,7 +28,7 @@ pub(super) fn between_ticks(clock: &dyn TimeSource, length: Ticks) -> Clock {
     }
 }
 
-/// Keeps time on a worker, until the core stops it. The errand and its object have a copy each.
+/// Keeps time on a worker, until the core stops it. The job and its object have a copy each.
 #[derive(Clone)]
 pub(super) struct Pace {
     clock: Arc<dyn TimeSource>,
@@ -36,9 +36,9 @@ pub(super) struct Pace {
 }
 
 impl Pace {
-    /// The pace of an object's errands.
-    pub(super) fn new(mcu: &Mcu) -> Pace {
-        Pace::of(mcu.clock())
+    /// The pace of an object's jobs.
+    pub(super) fn new(context: &Context) -> Pace {
+        Pace::of(context.clock())
     }
 
     /// A pace with this clock.
@@ -50,7 +50,7 @@ impl Pace {
         self.clock.now()
     }
 
-    /// Waits until `at`. False if the errand must end, because the MCU stopped.
+    /// Waits until `at`. False if the job must end, because the MCU stopped.
     pub(super) fn until(&self, at: Clock) -> bool {
         loop {
             if self.stopped.load(Ordering::Relaxed) {
@@ -75,12 +75,12 @@ impl Pace {
         self.until(between_ticks(&*self.clock, length));
     }
 
-    /// Makes the errand under way end soon. No wait succeeds until [`Pace::resume`].
+    /// Makes the job under way end soon. No wait succeeds until [`Pace::resume`].
     pub(super) fn stop(&self) {
         self.stopped.store(true, Ordering::Relaxed);
     }
 
-    /// Lets errands wait again.
+    /// Lets jobs wait again.
     pub(super) fn resume(&self) {
         self.stopped.store(false, Ordering::Relaxed);
     }

@@ -5,17 +5,15 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex, PoisonError};
-use std::thread;
-use std::time::Duration;
+use std::sync::Arc;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Timer, Turn,
+    BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Remote, Safe, Settable, Timer,
     WireClock, command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
-use crate::time::{CLOCK_FREQ, Clock, Ticks};
+use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
 use super::value_queue::{Texts, ValueQueue};
 
@@ -69,7 +67,7 @@ const ALL_CALL: u8 = 0x01;
 const FULL: u8 = 0x10;
 const OSCILLATOR_HZ: u64 = 25_000_000;
 /// Longest time until the oscillator runs.
-const OSCILLATOR_START: Duration = Duration::from_micros(500);
+const OSCILLATOR_START: Ticks = Ticks::from_us(500);
 /// The host gives no rate, and the driver has its own.
 const RATE_HZ: u32 = 100_000;
 
@@ -92,16 +90,16 @@ fn message(first: u8, value: u16) -> [u8; 5] {
     [first, on_low, on_high, off_low, off_high]
 }
 
-/// A chip, shared by its outputs. They all run on the worker of its bus. So nobody ever waits for the lock, and the
-/// core never takes it.
-struct Chip {
+/// A chip, on the worker of its bus.
+struct Pca {
     device: Box<dyn BusDevice>,
     calls: Calls,
+    clock: Arc<dyn TimeSource>,
     prescale: u8,
     is_set_up: bool,
 }
 
-impl Chip {
+impl Pca {
     /// Writes registers. Writing them twice does no harm, so a failed write is retried.
     fn write(&mut self, bytes: &[u8]) -> Result<(), BusError> {
         self.calls.repeat(|| self.device.write_read(bytes, &mut []))
@@ -115,48 +113,48 @@ impl Chip {
         self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | SLEEP | ALL_CALL])?;
         self.write(&[Register::PreScale as u8, self.prescale])?;
         self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | ALL_CALL])?;
-        thread::sleep(OSCILLATOR_START);
+        self.clock.spin_until(self.clock.now() + OSCILLATOR_START);
         self.write(&message(Register::AllLed as u8, 0))?;
         self.is_set_up = true;
         Ok(())
     }
 }
 
-/// One output of a chip.
-struct Channel {
-    chip: Arc<Mutex<Chip>>,
-    first_register: u8,
+/// A setting of one output of a chip.
+#[derive(Clone, Copy)]
+struct Setting {
+    channel: u8,
+    value: Value,
 }
 
 #[derive(Clone, Copy)]
-enum Setting {
+enum Value {
     /// Sets up the chip. The output is then off.
     SetUp,
-    Value(u16),
+    Of(u16),
     /// The output's value in a stopped MCU. A chip that was never set up drives nothing.
-    ShutdownValue(u16),
+    AtShutdown(u16),
 }
 
-impl Settable for Channel {
+impl Settable for Pca {
     type Value = Setting;
 
-    fn set(&mut self, setting: Setting) -> Result<(), Shutdown> {
-        let mut chip = self.chip.lock().unwrap_or_else(PoisonError::into_inner);
-        let value = match setting {
-            Setting::ShutdownValue(_) if !chip.is_set_up => return Ok(()),
-            Setting::Value(value) | Setting::ShutdownValue(value) => Some(value),
-            Setting::SetUp => None,
+    fn set(&mut self, Setting { channel, value }: Setting) -> Result<(), Shutdown> {
+        let value = match value {
+            Value::AtShutdown(_) if !self.is_set_up => return Ok(()),
+            Value::Of(value) | Value::AtShutdown(value) => Some(value),
+            Value::SetUp => None,
         };
-        chip.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.trouble))?;
+        self.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.trouble))?;
         let Some(value) = value else { return Ok(()) };
-        let written = chip.write(&message(self.first_register, value));
+        let written = self.write(&message(Register::Led0 as u8 + 4 * channel, value));
         written.map_err(|error| Shutdown::because(NOT_UPDATED, error.trouble))
     }
 }
 
 /// An output on the worker of its bus.
 struct Output {
-    channel: Remote<Channel>,
+    remote: Remote<Pca>,
     shutdown_value: u16,
     /// Whether the output was ever set.
     is_used: bool,
@@ -170,7 +168,7 @@ struct Address {
     cycle: Ticks,
 }
 
-/// The chips and their outputs. The errands of the outputs return to this object.
+/// The chips and their outputs. The jobs of the outputs return to this object.
 #[derive(Default)]
 struct Chips {
     chips: Vec<Address>,
@@ -182,7 +180,7 @@ struct Chips {
 
 impl Chips {
     /// Returns the index of an output. Opens the chip if this is its first output.
-    fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
+    fn output(&mut self, context: &mut Context, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
         let Address { bus, address, cycle } = wanted;
         let known = self.chips.iter().position(|chip| chip.bus == bus && chip.address == address);
         let chip = match known {
@@ -202,35 +200,35 @@ impl Chips {
                 return Err(Shutdown::because(TOO_MANY, cause).remedy("remove one"));
             }
             None => {
-                self.open(mcu, wanted)?;
+                self.open(context, wanted)?;
                 self.chips.len() - 1
             }
         };
         Ok(chip * CHANNELS + usize::from(channel))
     }
 
-    fn open(&mut self, mcu: &mut Mcu, address: Address) -> Result<(), Shutdown> {
+    fn open(&mut self, context: &mut Context, address: Address) -> Result<(), Shutdown> {
         let config = I2cConfig { bus: address.bus.into(), address: address.address & 0x7f, rate_hz: RATE_HZ };
-        let opened = mcu.board()?.i2c(config);
+        let opened = context.board()?.i2c(config);
         let OnWorker { bus, device } = opened.map_err(|error| Shutdown { reason: NOT_SET_UP, ..error })?;
-        let worker = mcu.worker(&bus)?;
-        let clock = mcu.clock();
-        let calls = self.calls.get_or_insert_with(|| Calls::new(clock)).clone();
-        let chip = Chip { device, calls, prescale: prescale(address.cycle), is_set_up: false };
-        let chip = Arc::new(Mutex::new(chip));
+        let clock = context.clock();
+        let calls = self.calls.get_or_insert_with(|| Calls::new(clock.clone())).clone();
+        let chip = Pca { device, calls, clock, prescale: prescale(address.cycle), is_set_up: false };
+        let chip = context.device(&bus, Box::new(chip))?;
         self.chips.push(address);
         for channel in 0..CHANNELS as u8 {
-            let channel = Channel { chip: chip.clone(), first_register: Register::Led0 as u8 + 4 * channel };
-            let channel = Remote::new(worker, channel, Setting::SetUp);
-            self.outputs.push(Output { channel, shutdown_value: 0, is_used: false, is_pending: false });
+            // There are 256 outputs at most.
+            let number = self.outputs.len() as u8;
+            let remote = Remote::new(number, chip, Setting { channel, value: Value::SetUp });
+            self.outputs.push(Output { remote, shutdown_value: 0, is_used: false, is_pending: false });
         }
         Ok(())
     }
 
-    fn set(&mut self, turn: &mut Turn, place: usize, setting: Setting) -> Result<(), Shutdown> {
+    fn set(&mut self, context: &mut Context, place: usize, value: Value) -> Result<(), Shutdown> {
         let output = &mut self.outputs[place];
         output.is_used = true;
-        output.channel.set(turn, setting)
+        output.remote.set(context, Setting { channel: (place % CHANNELS) as u8, value })
     }
 }
 
@@ -239,16 +237,15 @@ impl Object for Chips {
         "PCA9685"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let mut outputs = self.outputs.iter_mut();
-        let back = outputs.find_map(|output| output.channel.back(turn, done).map(|written| (output, written)));
-        match back {
-            Some((output, Ok(true))) => output.is_pending = false,
-            Some((_, Err(failure))) => return turn.device_failed(self.kind(), failure),
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(output) = self.outputs.get_mut(usize::from(number)) else { return Ok(()) };
+        match output.remote.back(context, finished) {
+            Some(Ok(true)) => output.is_pending = false,
+            Some(Err(failure)) => return context.device_failed(self.kind(), failure),
             _ => {}
         }
         if !self.outputs.iter().any(|output| output.is_pending) {
-            turn.is_safe();
+            context.is_safe();
         }
         Ok(())
     }
@@ -262,11 +259,12 @@ impl Object for Chips {
         false
     }
 
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
         let mut safe = Safe::Now;
-        for output in self.outputs.iter_mut().filter(|output| output.is_used) {
+        for (place, output) in self.outputs.iter_mut().enumerate().filter(|(_, output)| output.is_used) {
             output.is_pending = true;
-            output.channel.set(turn, Setting::ShutdownValue(output.shutdown_value))?;
+            let value = Value::AtShutdown(output.shutdown_value);
+            output.remote.set(context, Setting { channel: (place % CHANNELS) as u8, value })?;
             safe = Safe::Later;
         }
         Ok(safe)
@@ -283,11 +281,11 @@ struct Pca9685 {
 }
 
 impl Pca9685 {
-    fn queue(&mut self, turn: &mut Turn, at: Clock, value: u16) -> Result<(), Shutdown> {
+    fn queue(&mut self, context: &mut Context, at: Clock, value: u16) -> Result<(), Shutdown> {
         if value > VALUE_MAX {
             return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
         }
-        self.queue.queue(turn, at, value)
+        self.queue.queue(context, at, value)
     }
 }
 
@@ -296,15 +294,15 @@ impl Object for Pca9685 {
         "PCA9685 output"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        let value = self.queue.pop(turn)?;
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let value = self.queue.pop(context)?;
         let place = self.place;
-        turn.with::<Chips, _>(self.chips, |chips, turn| chips.set(turn, place, Setting::Value(value)))?;
+        context.with::<Chips, _>(self.chips, |chips, context| chips.set(context, place, Value::Of(value)))?;
         self.queue.next(value, at)
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.queue.clear(turn);
+    fn shutdown(&mut self, context: &mut Context) {
+        self.queue.clear(context);
     }
 }
 
@@ -319,7 +317,7 @@ fn check(channel: u8, values: &[u16]) -> Result<(), Shutdown> {
 
 const CONFIG_PCA9685: Command = command!(
     "config_pca9685 oid=%c bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
-    |mcu,
+    |context,
      oid: Oid,
      bus: u8,
      addr: u8,
@@ -328,34 +326,37 @@ const CONFIG_PCA9685: Command = command!(
      value: u16,
      default_value: u16,
      max_duration: Ticks| {
-        mcu.vacant(oid)?;
+        context.vacant(oid)?;
         check(channel, &[value, default_value])?;
-        let own = mcu.own::<Chips>();
-        let place = mcu.with::<Chips, _>(own, |chips, turn| {
-            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+        let own = context.own::<Chips>();
+        let place = context.with::<Chips, _>(own, |chips, context| {
+            let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
             chips.outputs[place].shutdown_value = default_value;
-            let setting = if value == 0 { Setting::SetUp } else { Setting::Value(value) };
-            chips.set(turn, place, setting)?;
+            let setting = if value == 0 { Value::SetUp } else { Value::Of(value) };
+            chips.set(context, place, setting)?;
             Ok(place)
         })?;
-        mcu.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
+        context.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
     }
 );
 
-const QUEUE_PCA9685_OUT: Command =
-    command!("queue_pca9685_out oid=%c clock=%u value=%hu", Pca9685, |output, turn, clock: WireClock, value: u16| {
-        let at = turn.instant(clock);
-        output.queue(turn, at, value)
-    });
+const QUEUE_PCA9685_OUT: Command = command!(
+    "queue_pca9685_out oid=%c clock=%u value=%hu",
+    Pca9685,
+    |output, context, clock: WireClock, value: u16| {
+        let at = context.instant(clock);
+        output.queue(context, at, value)
+    }
+);
 
 const SET_PCA9685_OUT: Command = command!(
     "set_pca9685_out bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu",
-    |mcu, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
+    |context, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
         check(channel, &[value])?;
-        let own = mcu.own::<Chips>();
-        mcu.with::<Chips, _>(own, |chips, turn| {
-            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
-            chips.set(turn, place, Setting::Value(value))
+        let own = context.own::<Chips>();
+        context.with::<Chips, _>(own, |chips, context| {
+            let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.set(context, place, Value::Of(value))
         })
     }
 );

@@ -6,8 +6,8 @@
 
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Present, Remote, Report, Safe,
-    Settable, Timer, Turn, WireClock, command,
+    BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Present, Remote, Report, Safe,
+    Settable, Timer, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -56,11 +56,11 @@ impl Settable for Channel {
 }
 
 /// Opens a channel. As in the firmware, several objects may have the same channel, each with its own files.
-fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
-    let OnWorker { bus, device: pwm } = mcu.board()?.pwm(config)?;
-    let (worker, calls) = (mcu.worker(&bus)?, Calls::new(mcu.clock()));
-    let channel = Channel { pwm, calls: calls.clone() };
-    Ok((Remote::new(worker, channel, Setting { value: config.value, cycle: None }), calls))
+fn open(context: &mut Context, number: u8, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
+    let OnWorker { bus, device: pwm } = context.board()?.pwm(config)?;
+    let calls = Calls::new(context.clock());
+    let channel = context.device(&bus, Box::new(Channel { pwm, calls: calls.clone() }))?;
+    Ok((Remote::new(number, channel, Setting { value: config.value, cycle: None }), calls))
 }
 
 const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM };
@@ -74,9 +74,9 @@ struct PwmOut {
 }
 
 impl PwmOut {
-    fn write(&mut self, turn: &mut Turn, value: u16) -> Result<(), Shutdown> {
+    fn write(&mut self, context: &mut Context, value: u16) -> Result<(), Shutdown> {
         self.value = value;
-        self.channel.set(turn, Setting { value, cycle: None })
+        self.channel.set(context, Setting { value, cycle: None })
     }
 }
 
@@ -85,14 +85,14 @@ impl Object for PwmOut {
         KIND
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        let value = self.queue.pop(turn)?;
-        self.write(turn, value)?;
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let value = self.queue.pop(context)?;
+        self.write(context, value)?;
         self.queue.next(value, at)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        self.channel.settle(turn, KIND, done)
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        self.channel.settle(context, KIND, finished)
     }
 
     fn report(&self) -> Report {
@@ -103,12 +103,12 @@ impl Object for PwmOut {
         Some(self.calls.counts())
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.queue.clear(turn);
+    fn shutdown(&mut self, context: &mut Context) {
+        self.queue.clear(context);
     }
 
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.write(turn, self.queue.shutdown_value())?;
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
+        self.write(context, self.queue.shutdown_value())?;
         Ok(Safe::Later)
     }
 }
@@ -121,24 +121,25 @@ struct SetChannels(Vec<(Pin, Remote<Channel>)>);
 impl SetChannels {
     /// Sets a channel. The channel stays open. As with `set_digital_out`, an open channel may be set again at any time.
     /// A new one is refused after `finalize_config`.
-    fn set(&mut self, turn: &mut Turn, config: PwmConfig) -> Result<(), Shutdown> {
+    fn set(&mut self, context: &mut Context, config: PwmConfig) -> Result<(), Shutdown> {
         let PwmConfig { pin, cycle, value, .. } = config;
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
-            Some(place) if turn.is_finalized() => {
+            Some(place) if context.is_finalized() => {
                 let setting = Setting { value, cycle: Some(cycle) };
-                self.0[place].1.set(turn, setting)
+                self.0[place].1.set(context, setting)
             }
-            _ if turn.is_finalized() => Err(set_too_late(turn, reason::PWM_CONFIG, "set_pwm_out", pin)),
+            _ if context.is_finalized() => Err(set_too_late(context, reason::PWM_CONFIG, "set_pwm_out", pin)),
             Some(place) => {
-                self.0[place].1 = open(turn, config)?.0;
+                self.0[place].1 = open(context, place as u8, config)?.0;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
             }
             None => {
-                self.0.push((pin, open(turn, config)?.0));
+                let number = self.0.len() as u8;
+                self.0.push((pin, open(context, number, config)?.0));
                 Ok(())
             }
         }
@@ -150,32 +151,32 @@ impl Object for SetChannels {
         "set_pwm_out"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let mut channels = self.0.iter_mut();
-        channels.try_for_each(|(_, channel)| channel.settle(turn, "set_pwm_out", done))
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let channel = self.0.get_mut(usize::from(number));
+        channel.map_or(Ok(()), |(_, channel)| channel.settle(context, "set_pwm_out", finished))
     }
 }
 
 const CONFIG_PWM_OUT: Command = command!(
     "config_pwm_out oid=%c pin=%u cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
-    |mcu, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
-        mcu.vacant(oid)?;
+    |context, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
+        context.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
-        let (channel, calls) = open(mcu, config)?;
+        let (channel, calls) = open(context, 0, config)?;
         let queue = ValueQueue::new(default_value, max_duration, &TEXTS);
-        mcu.assign_on(pin, oid, PwmOut { channel, calls, value, queue })
+        context.assign_on(pin, oid, PwmOut { channel, calls, value, queue })
     }
 );
 
 const QUEUE_PWM_OUT: Command =
-    command!("queue_pwm_out oid=%c clock=%u value=%hu", PwmOut, |output, turn, clock: WireClock, value: u16| {
-        let at = turn.instant(clock);
-        output.queue.queue(turn, at, value)
+    command!("queue_pwm_out oid=%c clock=%u value=%hu", PwmOut, |output, context, clock: WireClock, value: u16| {
+        let at = context.instant(clock);
+        output.queue.queue(context, at, value)
     });
 
 const SET_PWM_OUT: Command =
-    command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |mcu, pin: Pin, cycle_ticks: Ticks, value: u16| {
-        let oid = mcu.own::<SetChannels>();
+    command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |context, pin: Pin, cycle_ticks: Ticks, value: u16| {
+        let oid = context.own::<SetChannels>();
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value };
-        mcu.with::<SetChannels, _>(oid, |channels, turn| channels.set(turn, config))
+        context.with::<SetChannels, _>(oid, |channels, context| channels.set(context, config))
     });

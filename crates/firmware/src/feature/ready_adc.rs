@@ -13,8 +13,8 @@
 
 use std::sync::Arc;
 
-use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
-use crate::mcu::{Back, Conversation, Done, Errand, Mcu, Next, Object, Oid, Slot, Talk, Timer, Turn};
+use crate::board::{Bias, BusError, Direction, Line, Pin};
+use crate::mcu::{Back, Chip, Context, Finished, Job, JobSlot, Next, Object, Oid, Timer};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
@@ -23,6 +23,8 @@ use super::spi::Spi;
 use super::trigger_analog::Attached;
 
 const TIMER: Timer = Timer::sampling(0);
+/// The number of the job that reads a sample.
+const READING: u8 = 0;
 
 /// The result of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,16 +59,16 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
     /// The chip's name in the log.
     const NAME: &'static str;
     /// Reads a sample on a worker.
-    type Reading: Errand;
+    type Reading: Job;
 
     /// Starts to read a sample.
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown>;
+    fn read(&mut self, context: &mut Context, reading: &mut JobSlot<Self::Reading>) -> Result<(), Shutdown>;
 
     /// The shutdown for a chip that could not be read.
-    fn stop(failure: &<Self::Reading as Errand>::Failure) -> Shutdown;
+    fn stop(failure: &<Self::Reading as Job>::Failure) -> Shutdown;
 
     /// Converts the answer of a reading that counts. `late` says that the reading was not back in time.
-    fn sample(&mut self, answer: <Self::Reading as Errand>::Answer, late: bool) -> Sample;
+    fn sample(&mut self, answer: <Self::Reading as Job>::Out, late: bool) -> Sample;
 
     /// How many values make a sample.
     fn channels(&self) -> usize {
@@ -74,14 +76,14 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
     }
 
     /// Begins measurements, or ends them.
-    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
-        let _ = (turn, on);
+    fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
+        let _ = (context, on);
         Ok(())
     }
 
-    /// Another errand than a reading has returned.
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let _ = (turn, done);
+    /// A job of the chip's own has finished. Its number is not [`READING`].
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let _ = (context, number, finished);
         Ok(())
     }
 }
@@ -108,7 +110,7 @@ const READING_RESTS: u32 = 8;
 pub(super) struct ReadyAdc<C: ReadyChip> {
     chip: C,
     ready: Ready,
-    reading: Slot<C::Reading>,
+    reading: JobSlot<C::Reading>,
     /// Whether the reading under way is late.
     late: bool,
     rest_ticks: Ticks,
@@ -119,11 +121,11 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
 
 impl<C: ReadyChip> ReadyAdc<C> {
     /// A sensor.
-    pub(super) fn new(chip: C, ready: Ready, reading: Slot<C::Reading>) -> ReadyAdc<C> {
+    pub(super) fn new(chip: C, ready: Ready, reading: C::Reading) -> ReadyAdc<C> {
         ReadyAdc {
             chip,
             ready,
-            reading,
+            reading: JobSlot::numbered(READING, reading),
             late: false,
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
@@ -141,30 +143,30 @@ impl<C: ReadyChip> ReadyAdc<C> {
     }
 
     /// Begins measurements. `rest_ticks` of 0 ends them.
-    pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    pub(super) fn query(&mut self, context: &mut Context, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.restart();
         let on = rest_ticks != Ticks(0);
-        self.chip.switch(turn, on)?;
+        self.chip.switch(context, on)?;
         self.rest_ticks = rest_ticks;
         if !on {
             return Ok(());
         }
         self.bulk.reset();
-        let at = turn.now() + rest_ticks;
-        turn.schedule(TIMER, at)
+        let at = context.now() + rest_ticks;
+        context.schedule(TIMER, at)
     }
 
     /// Reports to the host how many samples there are. A sample that is being read counts as one in the chip. If the
     /// worker has to look, a sample in the chip does not count yet.
-    pub(super) fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        let now = turn.now();
+    pub(super) fn query_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        let now = context.now();
         let ready = match &self.ready {
             Ready::Line(line) => self.reading.is_pending() || !line.read()?,
             Ready::Look { .. } => false,
         };
         let bytes = (self.chip.channels() * VALUE_BYTES) as u32;
-        self.bulk.send_status(turn, (now, now), if ready { bytes } else { 0 });
+        self.bulk.send_status(context, (now, now), if ready { bytes } else { 0 });
         Ok(())
     }
 }
@@ -174,7 +176,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         C::NAME
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let is_pending = self.reading.is_pending();
         let (reads, rests) = match &mut self.ready {
             Ready::Line(_) if is_pending => (false, 4),
@@ -203,7 +205,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
             rests
         } else if self.reading.is_here() {
             self.late = false;
-            self.chip.read(turn, &mut self.reading)?;
+            self.chip.read(context, &mut self.reading)?;
             rests
         } else {
             1
@@ -211,14 +213,15 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         Ok(Next::At(at + Ticks(self.rest_ticks.0.wrapping_mul(rests))))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else {
-            return self.chip.returned(turn, done);
-        };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        if number != READING {
+            return self.chip.finished(context, number, finished);
+        }
+        let Some(Back { result, is_wanted, ended: read_at, .. }) = self.reading.back(finished) else { return Ok(()) };
         let answer = match result {
-            Ok(answer) if counts => answer,
+            Ok(answer) if is_wanted => answer,
             Ok(_) => return Ok(()),
-            Err(failure) => return turn.try_shut_down(C::stop(failure)),
+            Err(failure) => return context.try_shut_down(C::stop(failure)),
         };
         let mut bytes = [0; CHANNELS_MAX * VALUE_BYTES];
         let mut put = |values: &[i32]| {
@@ -234,27 +237,27 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         let len = match sample {
             Sample::NotReady => return Ok(()),
             Sample::Value(value) => {
-                self.attached.update(turn, value, read_at)?;
+                self.attached.update(context, value, read_at)?;
                 put(&[value])
             }
             Sample::Error { code, value } => {
                 if let Some(code) = code {
-                    self.attached.note_error(turn, code)?;
+                    self.attached.note_error(context, code)?;
                 }
                 put(&[value])
             }
             Sample::Channels { values, count, sum } => {
                 if let Some(sum) = sum {
-                    self.attached.update(turn, sum, read_at)?;
+                    self.attached.update(context, sum, read_at)?;
                 }
                 put(&values[..count.min(CHANNELS_MAX)])
             }
         };
-        self.bulk.add(turn, &bytes[..len]);
+        self.bulk.add(context, &bytes[..len]);
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.restart();
     }
 }
@@ -273,10 +276,12 @@ impl<const N: usize> Frame<N> {
     }
 }
 
-impl<const N: usize> Talk for Frame<N> {
-    type Answer = Frame<N>;
+impl<const N: usize> Job for Frame<N> {
+    type Device = Chip;
+    type Out = Frame<N>;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Frame<N>, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<Frame<N>, BusError> {
         self.bytes = [0; N];
         chip.exchange(&mut self.bytes[..self.len])?;
         Ok(*self)
@@ -284,21 +289,17 @@ impl<const N: usize> Talk for Frame<N> {
 }
 
 /// Makes a sensor with this `oid`. It is read over SPI in frames of `len` bytes.
-pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<Frame<N>>>>(
-    mcu: &mut Mcu,
+pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Frame<N>>>(
+    context: &mut Context,
     oid: Oid,
     (spi, ready_pin): (Oid, Pin),
     chip: C,
     len: usize,
 ) -> Result<(), Shutdown> {
-    mcu.vacant(oid)?;
-    mcu.require::<Spi>(spi)?;
-    let ready = mcu.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
-    mcu.assign_on(
-        ready_pin,
-        oid,
-        ReadyAdc::new(chip, Ready::Line(ready), Slot::talking(Frame { bytes: [0; N], len: len.min(N) })),
-    )
+    context.vacant(oid)?;
+    context.require::<Spi>(spi)?;
+    let ready = context.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
+    context.assign_on(ready_pin, oid, ReadyAdc::new(chip, Ready::Line(ready), Frame { bytes: [0; N], len: len.min(N) }))
 }
 
 /// Converts 24 bits in two's complement, the highest byte first.

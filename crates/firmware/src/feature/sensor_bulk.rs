@@ -11,7 +11,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Feature, Generation::V0_13, Mcu, Oid, Response, Turn, response, since};
+use crate::mcu::{Context, Feature, Generation::V0_13, Oid, Response, response, since};
 use crate::time::Clock;
 
 pub(super) const FEATURE: Feature = Feature { responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
@@ -45,9 +45,9 @@ pub(super) struct Words {
     /// Highest number of bytes of samples in a message.
     pub(super) data_max: usize,
     /// Sends samples.
-    pub(super) data: fn(&mut Mcu, BulkData<'_>),
+    pub(super) data: fn(&mut Context, BulkData<'_>),
     /// Sends how many samples there are.
-    pub(super) status: fn(&mut Mcu, Status),
+    pub(super) status: fn(&mut Context, Status),
 }
 
 /// How many samples there were between `clock` and `clock + query_ticks`.
@@ -92,9 +92,9 @@ macro_rules! own_words {
 
         const OWN_WORDS: $crate::feature::sensor_bulk::Words = $crate::feature::sensor_bulk::Words {
             data_max: $data_max,
-            data: |mcu, data| mcu.send(OwnData { oid: data.oid, sequence: data.sequence, data: data.data }),
-            status: |mcu, status| {
-                mcu.send(OwnStatus {
+            data: |context, data| context.send(OwnData { oid: data.oid, sequence: data.sequence, data: data.data }),
+            status: |context, status| {
+                context.send(OwnStatus {
                     oid: status.oid,
                     clock: status.clock,
                     query_ticks: status.query_ticks,
@@ -113,11 +113,11 @@ pub(super) use own_words;
 /// The messages of all sensors since v0.13.
 const COMMON: Words = Words {
     data_max: DATA_MAX,
-    data: |mcu, data| mcu.send(data),
-    status: |mcu, status| {
+    data: |context, data| context.send(data),
+    status: |context, status| {
         let Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows } = status;
         let buffered = u32::from(in_message) + in_sensor;
-        mcu.send(BulkStatus { oid, clock, query_ticks, next_sequence, buffered, possible_overflows });
+        context.send(BulkStatus { oid, clock, query_ticks, next_sequence, buffered, possible_overflows });
     },
 };
 
@@ -137,8 +137,8 @@ impl SensorBulk {
     }
 
     /// No measurements yet. The sensor has its own messages for hosts up to v0.12.
-    pub(super) fn with_own(mcu: &Mcu, own: &'static Words) -> SensorBulk {
-        SensorBulk::in_words(if mcu.speaks::<BulkData<'_>>() { &COMMON } else { own })
+    pub(super) fn with_own(context: &Context, own: &'static Words) -> SensorBulk {
+        SensorBulk::in_words(if context.speaks::<BulkData<'_>>() { &COMMON } else { own })
     }
 
     const fn in_words(words: &'static Words) -> SensorBulk {
@@ -151,25 +151,25 @@ impl SensorBulk {
     }
 
     /// Appends one sample. Sends the message when it has no room for another sample of this size.
-    pub(super) fn add(&mut self, turn: &mut Turn, sample: &[u8]) {
+    pub(super) fn add(&mut self, context: &mut Context, sample: &[u8]) {
         let end = self.len + sample.len();
         self.data[self.len..end].copy_from_slice(sample);
         self.len = end;
         if self.room() < sample.len() {
-            self.send(turn);
+            self.send(context);
         }
     }
 
     /// Sends the waiting samples, if there are any. Hosts up to v0.12 expect this last message of a measurement.
-    pub(super) fn flush(&mut self, turn: &mut Turn) {
+    pub(super) fn flush(&mut self, context: &mut Context) {
         if self.len > 0 {
-            self.send(turn);
+            self.send(context);
         }
     }
 
-    fn send(&mut self, turn: &mut Turn) {
-        let oid = turn.oid();
-        (self.words.data)(turn, BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
+    fn send(&mut self, context: &mut Context) {
+        let oid = context.oid();
+        (self.words.data)(context, BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
         self.sequence = self.sequence.wrapping_add(1);
         self.len = 0;
     }
@@ -186,9 +186,9 @@ impl SensorBulk {
 
     /// Reports to the host how many samples there are. `in_sensor` bytes are still in the sensor, as it said between
     /// `began` and `ended`.
-    pub(super) fn send_status(&self, turn: &mut Turn, (began, ended): (Clock, Clock), in_sensor: u32) {
+    pub(super) fn send_status(&self, context: &mut Context, (began, ended): (Clock, Clock), in_sensor: u32) {
         let status = Status {
-            oid: turn.oid(),
+            oid: context.oid(),
             clock: began,
             query_ticks: ended.wire().wrapping_sub(began.wire()),
             next_sequence: self.sequence,
@@ -196,6 +196,6 @@ impl SensorBulk {
             in_sensor,
             possible_overflows: self.possible_overflows,
         };
-        (self.words.status)(turn, status);
+        (self.words.status)(context, status);
     }
 }

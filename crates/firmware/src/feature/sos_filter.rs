@@ -161,8 +161,8 @@ impl Object for SosFilter {
 }
 
 const CONFIG_SOS_FILTER: Command =
-    command!("config_sos_filter oid=%c max_sections=%c", |mcu, oid: Oid, max_sections: u8| {
-        mcu.assign(oid, SosFilter::new(max_sections))
+    command!("config_sos_filter oid=%c max_sections=%c", |context, oid: Oid, max_sections: u8| {
+        context.assign(oid, SosFilter::new(max_sections))
     })
     .of(since(Master).and(Kalico));
 

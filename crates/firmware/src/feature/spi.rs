@@ -13,10 +13,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::board::soft_spi::SoftSpi;
-use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
+use crate::board::{BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
-    Back, Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Mcu, Object, Oid, Response, Safe, Slot, Talk, Turn, command, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -59,14 +59,17 @@ pub(super) struct Transfer {
     len: usize,
     /// Whether the bytes that come back are read.
     reads: bool,
+    /// Its round, if others may follow it at once, and the number of the round.
+    round: Option<(Round, u32)>,
 }
 
 impl Transfer {
-    const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true };
-
     /// An empty transfer, for a later load.
-    pub(super) fn slot() -> Slot<Conversation<Transfer>> {
-        Slot::talking(Transfer::EMPTY)
+    const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true, round: None };
+
+    /// A slot with an empty transfer.
+    pub(super) fn slot(number: u8) -> JobSlot<Transfer> {
+        JobSlot::numbered(number, Transfer::EMPTY)
     }
 
     /// Loads bytes to exchange for the bytes that come back.
@@ -87,19 +90,28 @@ impl Transfer {
     }
 }
 
-impl Talk for Transfer {
-    type Answer = ();
+impl Job for Transfer {
+    type Device = Chip;
+    type Out = ();
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<(), BusError> {
         let bytes = &mut self.bytes[..self.len];
-        if self.reads { chip.exchange(bytes) } else { chip.send(bytes) }
+        if self.reads {
+            return chip.exchange(bytes).inspect_err(|_| Round::end_of(&self.round));
+        }
+        // A transfer that reads is never skipped, because the host waits for its answer.
+        match &self.round {
+            Some((round, number)) if *number != round.number() => Ok(()),
+            round => chip.send(bytes).inspect_err(|_| Round::end_of(round)),
+        }
     }
 }
 
-/// Highest number of messages of one device under way. With this many, the core wakes up only for one of several.
+/// Highest number of transfers of one device under way. With this many, the core wakes up only for one of several.
 const UNDER_WAY_MAX: usize = 8;
 
-/// Numbers the messages that may be sent together. A failure or a stop takes the next number. Messages that still wait
+/// Numbers the transfers that may be sent together. A failure or a stop takes the next number. Transfers that still wait
 /// are then not sent.
 #[derive(Clone, Default)]
 struct Round(Arc<AtomicU32>);
@@ -112,25 +124,12 @@ impl Round {
     fn end(&self) {
         self.0.fetch_add(1, Ordering::AcqRel);
     }
-}
 
-/// A transfer that belongs to a round.
-struct Message {
-    transfer: Transfer,
-    round: Round,
-    /// The number of its round.
-    number: u32,
-}
-
-impl Talk for Message {
-    type Answer = ();
-
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        // A transfer that reads is not skipped, because the host waits for its answer.
-        if self.number != self.round.number() && !self.transfer.reads {
-            return Ok(());
+    /// Ends the round of a transfer that failed.
+    fn end_of(round: &Option<(Round, u32)>) {
+        if let Some((round, _)) = round {
+            round.end();
         }
-        self.transfer.talk(chip).inspect_err(|_| self.round.end())
     }
 }
 
@@ -138,17 +137,20 @@ impl Talk for Message {
 pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
-    messages: [Slot<Conversation<Message>>; UNDER_WAY_MAX],
+    transfers: [JobSlot<Transfer>; UNDER_WAY_MAX],
+    /// The next of them. They return in the order in which they were sent.
+    next: usize,
     round: Round,
 }
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
         let round = Round::default();
-        let messages = std::array::from_fn(|_| {
-            Slot::talking(Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
+        let transfers = std::array::from_fn(|number| {
+            let round = Some((round.clone(), 0));
+            JobSlot::numbered(number as u8, Transfer { round, ..Transfer::EMPTY })
         });
-        Spi { bus: None, chip_select, messages, round }
+        Spi { bus: None, chip_select, transfers, next: 0, round }
     }
 
     /// Whether the device has a chip select line of its own.
@@ -157,7 +159,7 @@ impl Spi {
     }
 
     /// Checks that the device may get a bus, with this mode.
-    fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
+    fn may_have_bus(&self, context: &Context, mode: u8) -> Result<(), Shutdown> {
         if mode > 3 {
             return Err(invalid(format_args!("mode {mode} is outside 0 to 3")));
         }
@@ -165,57 +167,63 @@ impl Spi {
             return Err(invalid("it has a bus already"));
         }
         // The firmware opens a bus even then. Here the core would have to wait for the files, and steps with it.
-        if mcu.is_finalized() {
+        if context.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
         Ok(())
     }
 
-    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
-        self.may_have_bus(mcu, mode)?;
+    fn set_bus(&mut self, context: &mut Context, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
+        self.may_have_bus(context, mode)?;
         let chip_select = self.chip_select.clone();
-        let opened = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
-        self.bus = Some(mcu.bus(opened)?);
+        let opened = context.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
+        self.bus = Some(context.bus(opened)?);
         Ok(())
     }
 
-    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
-        self.may_have_bus(mcu, mode)?;
+    fn set_lines(&mut self, context: &mut Context, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
+        self.may_have_bus(context, mode)?;
         let [miso, mosi, sclk] = pins;
         // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {
-            miso: mcu.shared_input(miso)?,
-            mosi: mcu.shared_output(mosi, false)?,
-            sclk: mcu.shared_output(sclk, false)?,
+            miso: context.shared_input(miso)?,
+            mosi: context.shared_output(mosi, false)?,
+            sclk: context.shared_output(sclk, false)?,
             mode,
             pulse,
             chip_select: self.chip_select.clone(),
-            clock: mcu.clock(),
+            clock: context.clock(),
         };
-        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        self.bus = Some(context.software_bus(Box::new(device))?);
         Ok(())
     }
 
     /// Starts a transfer: with an answer for `spi_transfer`, without one for `spi_send`.
-    fn transfer(&mut self, turn: &mut Turn, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
+    fn transfer(&mut self, context: &mut Context, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // A device without a bus echoes, as in the firmware.
             if answers {
-                turn.send(TransferResponse { oid: turn.oid(), response: data });
+                context.send(TransferResponse { oid: context.oid(), response: data });
             }
             return Ok(());
         };
-        // A slot is free, unless a bus has been hanging since before a stop.
-        let Some(slot) = self.messages.iter_mut().find(|slot| slot.is_here()) else {
+        let slot = &mut self.transfers[self.next];
+        // It is here, unless a bus has been hanging since before a stop.
+        let Some(transfer) = slot.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
-        if let Some(Conversation { talk: message, .. }) = slot.here() {
-            message.number = self.round.number();
-            if answers { message.transfer.load(data) } else { message.transfer.load_to_send(data) }
+        if let Some((round, number)) = &mut transfer.round {
+            *number = round.number();
         }
-        slot.converse_on(turn, bus)?;
+        if answers {
+            transfer.load(data)
+        } else {
+            transfer.load_to_send(data)
+        }
+        slot.send(context, bus.chip())?;
+        self.next = (self.next + 1) % UNDER_WAY_MAX;
         if !answers {
-            turn.let_join(UNDER_WAY_MAX as u32);
+            context.let_join(UNDER_WAY_MAX as u32);
         }
         Ok(())
     }
@@ -226,7 +234,7 @@ fn invalid(what: impl fmt::Display) -> Shutdown {
     Shutdown::by_host(INVALID_SPI, what)
 }
 
-/// The shutdown for a failed SPI conversation. It does not convert every `BusError`: an I2C bus has its own texts
+/// The shutdown for a failed SPI transfer. It does not convert every `BusError`: an I2C bus has its own texts
 /// (`i2c_shutdown`).
 pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
     Shutdown::because(SPI_TRANSFER_FAILED, error.trouble)
@@ -237,23 +245,19 @@ impl Object for Spi {
         "SPI device"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
         let kind = self.kind();
-        for slot in &mut self.messages {
-            let Some(Back { result, .. }) = slot.back(done) else { continue };
-            if let Err(error) = result {
-                let failure = spi_shutdown(error.clone());
-                return turn.device_failed(kind, failure);
-            }
-            if let Some(Conversation { talk: message, .. }) = slot.here().filter(|here| here.talk.transfer.reads) {
-                turn.send(TransferResponse { oid: turn.oid(), response: message.transfer.bytes() });
-            }
-            return Ok(());
+        let slot = &mut self.transfers[usize::from(number)];
+        if let Some(Back { result: Err(error), .. }) = slot.back(finished) {
+            return context.device_failed(kind, spi_shutdown(error.clone()));
+        }
+        if let Some(transfer) = slot.here().filter(|transfer| transfer.reads) {
+            context.send(TransferResponse { oid: context.oid(), response: transfer.bytes() });
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.round.end();
     }
 
@@ -265,7 +269,7 @@ impl Object for Spi {
 /// The message for a device at a shutdown.
 struct SpiShutdown {
     spi: Oid,
-    message: Slot<Conversation<Transfer>>,
+    message: JobSlot<Transfer>,
     bytes: Box<[u8]>,
 }
 
@@ -274,16 +278,16 @@ impl Object for SpiShutdown {
         "SPI shutdown message"
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.message.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.message.back(finished) else { return Ok(()) };
         match result {
             Ok(()) => {
-                turn.is_safe();
+                context.is_safe();
                 Ok(())
             }
             Err(error) => {
                 let failure = spi_shutdown(error.clone());
-                turn.device_failed(self.kind(), failure)
+                context.device_failed(self.kind(), failure)
             }
         }
     }
@@ -293,46 +297,49 @@ impl Object for SpiShutdown {
         false
     }
 
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        let has_bus = turn.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
+    fn make_safe(&mut self, context: &mut Context) -> Result<Safe, Shutdown> {
+        let has_bus = context.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
         if !has_bus {
             return Ok(Safe::Now);
         }
         if let Some(message) = self.message.here() {
-            message.talk.load_to_send(&self.bytes);
-            self.message.converse(turn, self.spi)?;
+            message.load_to_send(&self.bytes);
+            self.message.send_to(context, self.spi)?;
         }
         Ok(Safe::Later)
     }
 }
 
 const CONFIG_SPI: Command =
-    command!("config_spi oid=%c pin=%u cs_active_high=%c", |mcu, oid: Oid, pin: Pin, cs_active_high: bool| {
-        mcu.vacant(oid)?;
-        let line = mcu.shared_output(pin, !cs_active_high)?;
-        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: mcu.clock() };
-        mcu.assign_on(pin, oid, Spi::new(Some(chip_select)))
+    command!("config_spi oid=%c pin=%u cs_active_high=%c", |context, oid: Oid, pin: Pin, cs_active_high: bool| {
+        context.vacant(oid)?;
+        let line = context.shared_output(pin, !cs_active_high)?;
+        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: context.clock() };
+        context.assign_on(pin, oid, Spi::new(Some(chip_select)))
     });
 
 const CONFIG_SPI_WITHOUT_CS: Command =
-    command!("config_spi_without_cs oid=%c", |mcu, oid: Oid| mcu.assign(oid, Spi::new(None)));
+    command!("config_spi_without_cs oid=%c", |context, oid: Oid| context.assign(oid, Spi::new(None)));
 
-const SPI_SET_BUS: Command =
-    command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", Spi, |spi, turn, spi_bus: u32, mode: u32, rate: u32| {
+const SPI_SET_BUS: Command = command!(
+    "spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u",
+    Spi,
+    |spi, context, spi_bus: u32, mode: u32, rate: u32| {
         let mode = u8::try_from(mode).unwrap_or(u8::MAX);
-        spi.set_bus(turn, spi_bus, mode, rate)
-    });
+        spi.set_bus(context, spi_bus, mode, rate)
+    }
+);
 
 const SPI_SET_SOFTWARE_BUS: Command = command!(
     "spi_set_software_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u rate=%u",
     Spi,
-    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
+    |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
         // The firmware ignored the rate and was as fast as its system calls. Lines that are written through mapped
         // registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
-        spi.set_lines(turn, pins, mode, pulse)
+        spi.set_lines(context, pins, mode, pulse)
     }
 )
 .of(until(V0_13));
@@ -340,25 +347,25 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
     Spi,
-    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
+    |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
         // The mode has one byte, as in the firmware.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        spi.set_lines(turn, pins, mode, pulse_ticks)
+        spi.set_lines(context, pins, mode, pulse_ticks)
     }
 )
 .of(since(Master).and(Kalico));
 
 const SPI_TRANSFER: Command =
-    command!("spi_transfer oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, true, data));
+    command!("spi_transfer oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, true, data));
 
 const SPI_SEND: Command =
-    command!("spi_send oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, false, data)).joining();
+    command!("spi_send oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, false, data)).joining();
 
 const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
-    |mcu, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
-        mcu.require::<Spi>(spi_oid)?;
-        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(), bytes: shutdown_msg.into() })
+    |context, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
+        context.require::<Spi>(spi_oid)?;
+        context.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(0), bytes: shutdown_msg.into() })
     }
 );

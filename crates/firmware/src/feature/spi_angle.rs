@@ -8,8 +8,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::V0_12, Generation::V0_13,
-    Generations, Hold, Next, Object, Oid, Response, Slot, Timer, Turn, WireClock, command, response, until,
+    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::V0_12, Generation::V0_13,
+    Generations, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -58,12 +58,12 @@ response! {
 /// The messages up to v0.12.
 const OWN_WORDS: Words = Words {
     data_max: 48,
-    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
-    status: |mcu, Status { oid, next_sequence, .. }| mcu.send(OwnEnd { oid, sequence: next_sequence }),
+    data: |context, BulkData { oid, sequence, data }| context.send(OwnData { oid, sequence, data }),
+    status: |context, Status { oid, next_sequence, .. }| context.send(OwnEnd { oid, sequence: next_sequence }),
 };
 
 response! {
-    /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow to tell.
+    /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow for a time.
     "spi_angle_transfer_response oid=%c clock=%u response=%*s" => KNOWN;
     pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
 }
@@ -250,6 +250,10 @@ struct Upcoming {
 
 const KIND: &str = "angle sensor";
 
+// The numbers of the jobs.
+const MEASUREMENT: u8 = 0;
+const TRANSFER: u8 = 1;
+
 struct SpiAngle {
     chip: Chip,
     spi: Oid,
@@ -262,14 +266,14 @@ struct SpiAngle {
     /// The host's transfer waits for the request under way. Commands wait for the transfer.
     asked: Option<Hold>,
     /// For measurements, and prefaces of transfers.
-    measurement: Slot<Conversation<Transfer>>,
+    measurement: JobSlot<Transfer>,
     /// For transfers of the host.
-    transfer: Slot<Conversation<Transfer>>,
+    transfer: JobSlot<Transfer>,
 }
 
 impl SpiAngle {
     /// Begins the next request, if none is under way. The host goes first.
-    fn go_on(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    fn go_on(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if self.asking.is_some() {
             return Ok(());
         }
@@ -277,7 +281,7 @@ impl SpiAngle {
             Purpose::Transfer { hold: Some(hold) }
         } else if let Some(Upcoming { due, missed }) = self.upcoming.take() {
             for _ in 0..missed {
-                self.bulk.add(turn, &entry(Err(Fault::Overflow), 0, 0));
+                self.bulk.add(context, &entry(Err(Fault::Overflow), 0, 0));
             }
             Purpose::Measurement { due: Some(due) }
         } else {
@@ -286,26 +290,26 @@ impl SpiAngle {
         let preface = self.chip.preface(&purpose);
         let asking = self.asking.insert(Asking { purpose, latched: None });
         let begun = match (preface, &asking.purpose) {
-            (Some(preface), _) => self.say(turn, preface),
-            (None, Purpose::Measurement { .. }) => self.say(turn, self.chip.message()),
-            (None, Purpose::Transfer { .. }) => self.transfer.converse(turn, self.spi),
+            (Some(preface), _) => self.say(context, preface),
+            (None, Purpose::Measurement { .. }) => self.say(context, self.chip.message()),
+            (None, Purpose::Transfer { .. }) => self.transfer.send_to(context, self.spi),
         };
         if begun.is_err() {
-            self.over(turn);
+            self.over(context);
         }
         begun
     }
 
-    fn say(&mut self, turn: &mut Turn, message: &[u8]) -> Result<(), Shutdown> {
-        // Nothing else is under way, so the conversation is here.
+    fn say(&mut self, context: &mut Context, message: &[u8]) -> Result<(), Shutdown> {
+        // Nothing else is under way, so the job is here.
         if let Some(measurement) = self.measurement.here() {
-            measurement.talk.load(message);
+            measurement.load(message);
         }
-        self.measurement.converse(turn, self.spi)
+        self.measurement.send_to(context, self.spi)
     }
 
-    /// Processes the end of a conversation. Returns true if the request is finished.
-    fn take_in(&mut self, turn: &mut Turn, began: Clock, ended: Clock) -> Result<bool, Shutdown> {
+    /// Processes the end of a job. Returns true if the request is finished.
+    fn take_in(&mut self, context: &mut Context, began: Clock, ended: Clock) -> Result<bool, Shutdown> {
         let Some(Asking { purpose, latched }) = &mut self.asking else { return Ok(true) };
         let too_slow = ended.since(began) > i64::from(TRANSFER_MAX.0);
         let has_preface = self.chip.preface(purpose).is_some();
@@ -315,11 +319,11 @@ impl SpiAngle {
                 // The TLE5012B latches at an edge, so the length of its preface does not matter.
                 Purpose::Measurement { due } if self.chip == Chip::As5047d && too_slow => {
                     let due = *due;
-                    self.measured(turn, due, Err(Fault::SpiTime), ended);
+                    self.measured(context, due, Err(Fault::SpiTime), ended);
                     return Ok(true);
                 }
-                Purpose::Measurement { .. } => self.say(turn, self.chip.message())?,
-                Purpose::Transfer { .. } => self.transfer.converse(turn, self.spi)?,
+                Purpose::Measurement { .. } => self.say(context, self.chip.message())?,
+                Purpose::Transfer { .. } => self.transfer.send_to(context, self.spi)?,
             }
             return Ok(false);
         }
@@ -327,32 +331,32 @@ impl SpiAngle {
         let latched = latched.unwrap_or(if self.chip.latches_at_end(purpose) { ended } else { began });
         match (purpose, self.measurement.here(), self.transfer.here()) {
             (Purpose::Transfer { .. }, _, Some(transfer)) => {
-                let response = if too_slow { &[] } else { transfer.talk.bytes() };
-                turn.send(TransferResponse { oid: turn.oid(), clock: latched, response });
+                let response = if too_slow { &[] } else { transfer.bytes() };
+                context.send(TransferResponse { oid: context.oid(), clock: latched, response });
             }
             (Purpose::Measurement { due }, Some(measurement), _) => {
                 let due = *due;
                 let mut reply = [0; MESSAGE_MAX];
-                reply.iter_mut().zip(measurement.talk.bytes()).for_each(|(to, from)| *to = *from);
+                reply.iter_mut().zip(measurement.bytes()).for_each(|(to, from)| *to = *from);
                 let measured = if too_slow { Err(Fault::SpiTime) } else { self.chip.decode(&reply) };
-                self.measured(turn, due, measured, latched);
+                self.measured(context, due, measured, latched);
             }
             _ => {}
         }
         Ok(true)
     }
 
-    fn measured(&mut self, turn: &mut Turn, due: Option<Clock>, measured: Result<Angle, Fault>, latched: Clock) {
+    fn measured(&mut self, context: &mut Context, due: Option<Clock>, measured: Result<Angle, Fault>, latched: Clock) {
         if let Some(due) = due {
             let late = latched.wire().wrapping_sub(due.wire());
-            self.bulk.add(turn, &entry(measured, late, self.time_shift));
+            self.bulk.add(context, &entry(measured, late, self.time_shift));
         }
     }
 
     /// Ends the request under way, and releases the commands that wait for it.
-    fn over(&mut self, turn: &mut Turn) {
+    fn over(&mut self, context: &mut Context) {
         if let Some(Asking { purpose: Purpose::Transfer { hold: Some(hold) }, .. }) = self.asking.take() {
-            turn.release(hold);
+            context.release(hold);
         }
     }
 
@@ -364,32 +368,32 @@ impl SpiAngle {
         self.upcoming = None;
     }
 
-    fn query(&mut self, turn: &mut Turn, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
+    fn query(&mut self, context: &mut Context, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
-            if turn.speaks::<OwnEnd>() {
-                self.bulk.flush(turn);
-                let now = turn.now();
-                self.bulk.send_status(turn, (now, now), 0);
+            if context.speaks::<OwnEnd>() {
+                self.bulk.flush(context);
+                let now = context.now();
+                self.bulk.send_status(context, (now, now), 0);
             }
             return Ok(());
         }
         self.rest_ticks = rest_ticks;
         self.time_shift = time_shift;
         self.bulk.reset();
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 
-    fn ask(&mut self, turn: &mut Turn, data: &[u8]) -> Result<(), Shutdown> {
-        // Commands wait for each other, so the conversation is here. One from before a stop may still be under way.
+    fn ask(&mut self, context: &mut Context, data: &[u8]) -> Result<(), Shutdown> {
+        // Commands wait for each other, so the job is here. One from before a stop may still be under way.
         let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
         };
-        transfer.talk.load(data);
+        transfer.load(data);
         // A timer may have begun the request under way. The transfer behind it then does not hold commands by itself.
-        self.asked = Some(turn.hold());
-        self.go_on(turn)
+        self.asked = Some(context.hold());
+        self.go_on(context)
     }
 }
 
@@ -398,28 +402,28 @@ impl Object for SpiAngle {
         KIND
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let missed = self.upcoming.take().map_or(0, |upcoming| upcoming.missed.saturating_add(1));
         self.upcoming = Some(Upcoming { due: at, missed });
-        self.go_on(turn)?;
+        self.go_on(context)?;
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let back = self.measurement.back(done).or_else(|| self.transfer.back(done));
-        let Some(Back { result, began, ended, .. }) = back else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let slot = if number == TRANSFER { &mut self.transfer } else { &mut self.measurement };
+        let Some(Back { result, began, ended, .. }) = slot.back(finished) else { return Ok(()) };
         let is_over = match result {
-            Ok(()) => self.take_in(turn, began, ended),
-            Err(error) => turn.device_failed(KIND, spi_shutdown(error.clone())).map(|()| true),
+            Ok(()) => self.take_in(context, began, ended),
+            Err(error) => context.device_failed(KIND, spi_shutdown(error.clone())).map(|()| true),
         };
         if !matches!(is_over, Ok(false)) {
-            self.over(turn);
+            self.over(context);
         }
         is_over?;
-        self.go_on(turn)
+        self.go_on(context)
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
+    fn shutdown(&mut self, context: &mut Context) {
         self.end();
         // A stopped MCU is not held.
         let under_way = match &mut self.asking {
@@ -427,33 +431,33 @@ impl Object for SpiAngle {
             _ => None,
         };
         for hold in self.asked.take().into_iter().chain(under_way) {
-            turn.release(hold);
+            context.release(hold);
         }
     }
 }
 
 const CONFIG_SPI_ANGLE: Command = command!(
     "config_spi_angle oid=%c spi_oid=%c spi_angle_type=%c",
-    |mcu, oid: Oid, spi_oid: Oid, spi_angle_type: u8| {
+    |context, oid: Oid, spi_oid: Oid, spi_angle_type: u8| {
         let chip = Chip::of(spi_angle_type)?;
-        mcu.vacant(oid)?;
-        if !mcu.with::<Spi, _>(spi_oid, |spi, _| Ok(spi.has_chip_select()))? {
+        context.vacant(oid)?;
+        if !context.with::<Spi, _>(spi_oid, |spi, _| Ok(spi.has_chip_select()))? {
             let cause = "its SPI device has no chip select line of its own";
             return Err(Shutdown::because(NEEDS_CS, cause).remedy("set cs_pin to a GPIO line, not to None"));
         }
         let sensor = SpiAngle {
             chip,
             spi: spi_oid,
-            bulk: SensorBulk::with_own(mcu, &OWN_WORDS),
+            bulk: SensorBulk::with_own(context, &OWN_WORDS),
             rest_ticks: Ticks(0),
             time_shift: 0,
             asking: None,
             upcoming: None,
             asked: None,
-            measurement: Transfer::slot(),
-            transfer: Transfer::slot(),
+            measurement: Transfer::slot(MEASUREMENT),
+            transfer: Transfer::slot(TRANSFER),
         };
-        mcu.assign(oid, sensor)
+        context.assign(oid, sensor)
     }
 )
 .of(KNOWN);
@@ -461,15 +465,15 @@ const CONFIG_SPI_ANGLE: Command = command!(
 const QUERY_SPI_ANGLE: Command = command!(
     "query_spi_angle oid=%c clock=%u rest_ticks=%u time_shift=%c",
     SpiAngle,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
-        let at = turn.instant(clock);
-        sensor.query(turn, at, rest_ticks, time_shift)
+    |sensor, context, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
+        let at = context.instant(clock);
+        sensor.query(context, at, rest_ticks, time_shift)
     }
 )
 .of(KNOWN);
 
 const SPI_ANGLE_TRANSFER: Command =
-    command!("spi_angle_transfer oid=%c data=%*s", SpiAngle, |sensor, turn, data: &[u8]| sensor.ask(turn, data))
+    command!("spi_angle_transfer oid=%c data=%*s", SpiAngle, |sensor, context, data: &[u8]| sensor.ask(context, data))
         .of(KNOWN);
 
 #[cfg(test)]

@@ -75,33 +75,31 @@ type Screen = Display<St7920>;
 
 const CONFIG_ST7920: Command = command!(
     "config_st7920 oid=%c cs_pin=%u sclk_pin=%u sid_pin=%u sync_delay_ticks=%u cmd_delay_ticks=%u",
-    |mcu, oid: Oid, cs_pin: Pin, sclk_pin: Pin, sid_pin: Pin, sync_delay_ticks: Ticks, cmd_delay_ticks: Ticks| {
-        mcu.vacant(oid)?;
-        let pace = Pace::new(mcu);
+    |context, oid: Oid, cs_pin: Pin, sclk_pin: Pin, sid_pin: Pin, sync_delay_ticks: Ticks, cmd_delay_ticks: Ticks| {
+        context.vacant(oid)?;
+        let pace = Pace::new(context);
         let panel = St7920 {
             busy: Busy::new(pace.clone()),
             sync_delay: sync_delay_ticks,
             delay: cmd_delay_ticks,
-            sclk: Wire::claim(mcu, sclk_pin)?,
-            sid: Wire::claim(mcu, sid_pin)?,
+            sclk: Wire::claim(context, sclk_pin)?,
+            sid: Wire::claim(context, sid_pin)?,
         };
         // The display is selected from now on, even in a stopped MCU.
-        mcu.shared_output(cs_pin, true)?;
-        let display = Display::new(mcu, "ST7920 display", pace, panel)?;
-        mcu.assign_on(sclk_pin, oid, display)
+        context.shared_output(cs_pin, true)?;
+        let display = Display::new(context, "ST7920 display", pace, panel)?;
+        context.assign_on(sclk_pin, oid, display)
     }
 );
 
-const ST7920_SEND_CMDS: Command =
-    command!("st7920_send_cmds oid=%c cmds=%*s", Screen, |display, turn, cmds: &[u8]| display.write(
-        turn,
-        Register::Commands,
-        cmds
-    ));
+const ST7920_SEND_CMDS: Command = command!(
+    "st7920_send_cmds oid=%c cmds=%*s",
+    Screen,
+    |display, context, cmds: &[u8]| display.write(context, Register::Commands, cmds)
+);
 
-const ST7920_SEND_DATA: Command =
-    command!("st7920_send_data oid=%c data=%*s", Screen, |display, turn, data: &[u8]| display.write(
-        turn,
-        Register::Data,
-        data
-    ));
+const ST7920_SEND_DATA: Command = command!(
+    "st7920_send_data oid=%c data=%*s",
+    Screen,
+    |display, context, data: &[u8]| display.write(context, Register::Data, data)
+);

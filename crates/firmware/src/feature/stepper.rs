@@ -8,8 +8,8 @@ use std::ops::Range;
 
 use crate::board::Pin;
 use crate::mcu::{
-    Batch, Command, Constant, Feature, Generation::Kalico, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid,
-    Present, PromptLine, Report, Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
+    Batch, Command, Constant, Context, Feature, Generation::Kalico, Generation::V0_13, MoveQueue, Next, Object, Oid,
+    Present, PromptLine, Report, Response, SPIN_MAX, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -109,7 +109,7 @@ struct Stepper {
     step: PromptLine,
     dir: PromptLine,
     /// The step pin's idle level.
-    invert_step: bool,
+    idle_step: bool,
     /// Every edge is a step. Otherwise an edge back follows each step.
     both_edges: bool,
     /// The shortest time between two edges. Zero if it is shorter than a [`CALL`] that makes an edge.
@@ -149,8 +149,8 @@ const POSITION_BIAS: u32 = 0x4000_0000;
 
 impl Stepper {
     /// Takes the next move. `earliest` is the earliest time of its first edge. `None`: the stepper is idle.
-    fn load(&mut self, turn: &mut Turn, earliest: Option<Clock>) -> Result<Next, Shutdown> {
-        let Some(item) = self.queue.pop(&mut turn.moves) else {
+    fn load(&mut self, context: &mut Context, earliest: Option<Clock>) -> Result<Next, Shutdown> {
+        let Some(item) = self.queue.pop(context.moves()) else {
             self.edges = 0;
             return Ok(Next::Done);
         };
@@ -163,7 +163,7 @@ impl Stepper {
         let Some(earliest) = earliest else {
             // After a long pause the interval has wrapped, but the step's 32-bit clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
-            self.next_step = turn.instant(WireClock(clock));
+            self.next_step = context.instant(WireClock(clock));
             // Any earlier pulse is over, as for the firmware.
             self.earliest = self.next_step;
             if reverses {
@@ -186,11 +186,11 @@ impl Stepper {
             if self.both_edges {
                 // The last step's pulse must end before the direction changes.
                 self.reverse_pending = true;
-                return Ok(self.edge_at(turn, self.next_step.min(earliest), earliest));
+                return Ok(self.edge_at(context, self.next_step.min(earliest), earliest));
             }
-            return self.reverse(turn);
+            return self.reverse(context);
         }
-        Ok(self.edge_at(turn, self.next_step, earliest))
+        Ok(self.edge_at(context, self.next_step, earliest))
     }
 
     /// Sets the time of the next edge: its due time, or `earliest` if that is later. `earliest` is the end of a pulse
@@ -202,16 +202,16 @@ impl Stepper {
     /// sample of an endstop before the first of the steps between them. It would home at a wrong place. A stepper that
     /// nothing stops does not wait: the pulses of several steppers would add up, and none would catch up.
     #[inline]
-    fn edge_at(&mut self, turn: &mut Turn, due: Clock, earliest: Clock) -> Next {
+    fn edge_at(&mut self, context: &mut Context, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
         let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
-        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(turn);
+        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(context);
         Next::At(if in_order { due } else { due.max(earliest) })
     }
 
     /// Whether a trsync waits for a trigger that stops this stepper.
-    fn may_be_stopped(&self, turn: &mut Turn) -> bool {
-        self.stopper.is_some_and(|trsync| Trsync::may_stop(turn, trsync))
+    fn may_be_stopped(&self, context: &mut Context) -> bool {
+        self.stopper.is_some_and(|trsync| Trsync::may_stop(context, trsync))
     }
 
     /// Moves on to the next step, `interval` later on a 32-bit clock. A time that is 2^31 ticks or more after
@@ -222,11 +222,11 @@ impl Stepper {
     }
 
     /// Changes the direction. The next step waits for the setup time.
-    fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
+    fn reverse(&mut self, context: &mut Context) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         self.dir.flush();
-        let earliest = turn.now() + self.pulse_ticks;
-        Ok(self.edge_at(turn, self.next_step, earliest))
+        let earliest = context.now() + self.pulse_ticks;
+        Ok(self.edge_at(context, self.next_step, earliest))
     }
 
     /// The position that the host knows: after the steps made so far.
@@ -236,7 +236,7 @@ impl Stepper {
         if position & 0x8000_0000 != 0 { position.wrapping_neg() } else { position }
     }
 
-    fn stop(&mut self, mcu: &mut Mcu) {
+    fn stop(&mut self, context: &mut Context) {
         // Another stepper of the batch has stopped the MCU.
         self.edges = self.edges.saturating_sub(u32::from(self.step.was_batched()));
         self.position = self.position().wrapping_neg();
@@ -246,19 +246,19 @@ impl Stepper {
         self.next_dir = false;
         self.need_reset = true;
         self.stopper = None;
-        self.queue.clear(&mut mcu.moves);
+        self.queue.clear(context.moves());
     }
 
     /// Sets the lines to the levels of an idle motor.
     fn idle(&mut self) -> Result<(), Shutdown> {
         let dir = self.dir.write(false);
         if !self.both_edges {
-            self.step.write(self.invert_step)?;
+            self.step.write(self.idle_step)?;
         }
         dir
     }
 
-    fn queue(&mut self, turn: &mut Turn, mut item: Move) -> Result<(), Shutdown> {
+    fn queue(&mut self, context: &mut Context, mut item: Move) -> Result<(), Shutdown> {
         if item.count == 0 {
             return Err(Shutdown::by_host(INVALID_COUNT, "a move has no steps"));
         }
@@ -267,12 +267,12 @@ impl Stepper {
         }
         item.reverses = self.last_dir != self.next_dir;
         self.last_dir = self.next_dir;
-        self.queue.push(&mut turn.moves, item)?;
+        self.queue.push(context.moves(), item)?;
         if self.edges > 0 {
             return Ok(());
         }
-        match self.load(turn, None)? {
-            Next::At(at) => turn.schedule(TIMER, at),
+        match self.load(context, None)? {
+            Next::At(at) => context.schedule(TIMER, at),
             Next::Done => Ok(()),
         }
     }
@@ -284,37 +284,37 @@ impl Object for Stepper {
     }
 
     #[inline]
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
-        turn.spin_until(self.earliest);
+    fn event(&mut self, context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+        context.spin_until(self.earliest);
         if self.reverse_pending {
             self.reverse_pending = false;
-            return self.reverse(turn);
+            return self.reverse(context);
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
             // A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
             if self.pulse_ticks > Ticks(0) {
                 self.step.flush();
-                turn.now();
+                context.now();
             } else {
-                turn.made_edge();
+                context.made_edge();
             }
         }
-        let earliest = turn.last_read() + self.pulse_ticks;
+        let earliest = context.last_read() + self.pulse_ticks;
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {
             self.edges = edges;
-            return Ok(self.edge_at(turn, (self.next_step + self.pulse_ticks).min(earliest), earliest));
+            return Ok(self.edge_at(context, (self.next_step + self.pulse_ticks).min(earliest), earliest));
         }
         if edges > 0 {
             self.edges = edges;
             let interval = self.intervals.next();
             self.advance(interval, earliest);
-            return Ok(self.edge_at(turn, self.next_step, earliest));
+            return Ok(self.edge_at(context, self.next_step, earliest));
         }
         // How late the next step is must be known well.
-        let earliest = turn.now() + self.pulse_ticks;
-        self.load(turn, Some(earliest))
+        let earliest = context.now() + self.pulse_ticks;
+        self.load(context, Some(earliest))
     }
 
     fn join(&mut self, batch: &mut Batch) -> bool {
@@ -322,41 +322,38 @@ impl Object for Stepper {
         !self.reverse_pending && self.earliest <= batch.now() && self.step.join(batch)
     }
 
-    fn triggered(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        turn.cancel(TIMER);
-        self.stop(turn);
+    fn triggered(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+        context.cancel(TIMER);
+        self.stop(context);
         self.idle()
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.stop(turn);
+    fn shutdown(&mut self, context: &mut Context) {
+        self.stop(context);
     }
 
     fn report(&self) -> Report {
         let position = self.position().wrapping_sub(POSITION_BIAS) as i32;
         Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
     }
-
-    fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.idle().map(|()| Safe::Now)
-    }
 }
 
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
-    |mcu, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
-        mcu.vacant(oid)?;
-        let idle = invert_step > 0;
-        let step = mcu.prompt_output(step_pin, "step", idle, idle)?;
-        let dir = mcu.prompt_output(dir_pin, "dir", false, false)?;
+    |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
+        context.vacant(oid)?;
+        let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
+        // After a step on either edge, a stop leaves the level: another edge would be another step.
+        let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
+        let dir = context.prompt_output(dir_pin, "dir", false, false)?;
         let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
         let stepper = Stepper {
             step,
             dir,
-            invert_step: idle,
-            both_edges: invert_step < 0,
+            idle_step,
+            both_edges,
             pulse_ticks,
-            late_limit: mcu.step_late_limit(),
+            late_limit: context.step_late_limit(),
             queue: MoveQueue::default(),
             edges: 0,
             intervals: Intervals::default(),
@@ -369,16 +366,16 @@ const CONFIG_STEPPER: Command = command!(
             need_reset: false,
             stopper: None,
         };
-        mcu.assign_on(step_pin, oid, stepper)
+        context.assign_on(step_pin, oid, stepper)
     }
 );
 
 const QUEUE_STEP: Command = command!(
     "queue_step oid=%c interval=%u count=%hu add=%hi",
     Stepper,
-    |stepper, turn, interval: u32, count: u16, add: i16| {
+    |stepper, context, interval: u32, count: u16, add: i16| {
         let item = Move { interval, count, add, add2: 0, shift: 0, reverses: false };
-        stepper.queue(turn, item)
+        stepper.queue(context, item)
     }
 );
 
@@ -387,13 +384,13 @@ const QUEUE_STEP: Command = command!(
 const QUEUE_STEP_HP: Command = command!(
     "queue_step_hp oid=%c interval=%u count=%hu add=%hi add2=%hi shift=%hi",
     Stepper,
-    |stepper, turn, interval: u32, count: u16, add: i16, add2: i16, shift: i16| {
+    |stepper, context, interval: u32, count: u16, add: i16, add2: i16, shift: i16| {
         let limits = -i16::from(Intervals::SHIFT_MAX)..=i16::from(Intervals::SHIFT_MAX);
         if i16::try_from(count).is_err() || !limits.contains(&shift) {
             let what = format_args!("queue_step_hp has a count of {count} and a shift of {shift}");
             return Err(Shutdown::by_host(INVALID_COUNT, what));
         }
-        stepper.queue(turn, Move { interval, count, add, add2, shift: shift as i8, reverses: false })
+        stepper.queue(context, Move { interval, count, add, add2, shift: shift as i8, reverses: false })
     }
 )
 .of(since(Kalico));
@@ -404,8 +401,8 @@ const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", S
 });
 
 const RESET_STEP_CLOCK: Command =
-    command!("reset_step_clock oid=%c clock=%u", Stepper, |stepper, turn, clock: WireClock| {
-        let clock = turn.instant(clock);
+    command!("reset_step_clock oid=%c clock=%u", Stepper, |stepper, context, clock: WireClock| {
+        let clock = context.instant(clock);
         if stepper.edges > 0 {
             return Err(Shutdown::by_host(RESET_WHILE_STEPPING, "reset_step_clock came while steps are queued"));
         }
@@ -414,14 +411,14 @@ const RESET_STEP_CLOCK: Command =
         Ok(())
     });
 
-const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", Stepper, |stepper, turn| {
-    turn.send(Position { oid: turn.oid(), pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
+const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", Stepper, |stepper, context| {
+    context.send(Position { oid: context.oid(), pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
     Ok(())
 });
 
 const STEPPER_STOP_ON_TRIGGER: Command =
-    command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", Stepper, |stepper, turn, trsync_oid: Oid| {
-        Trsync::add_signal(turn, trsync_oid)?;
+    command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", Stepper, |stepper, context, trsync_oid: Oid| {
+        Trsync::add_signal(context, trsync_oid)?;
         stepper.stopper = Some(trsync_oid);
         Ok(())
     });

@@ -7,8 +7,8 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response,
-    Slot, Talk, Timer, Turn, WireClock, command, response, since,
+    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Job, JobSlot, Next, Object, Oid,
+    Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -123,11 +123,13 @@ fn types(_board: &dyn Board) -> Vec<Range> {
 /// One look at the chip.
 struct Look(Chip);
 
-impl Talk for Look {
+impl Job for Look {
+    type Device = dyn BusDevice;
     /// The word, and the fault bits.
-    type Answer = (u32, u8);
+    type Out = (u32, u8);
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(u32, u8), BusError> {
+    fn run(&mut self, chip: &mut Self::Device) -> Result<(u32, u8), BusError> {
         let template = self.0.word_message();
         let mut buffer = [0; 4];
         let word = &mut buffer[..template.len()];
@@ -145,20 +147,20 @@ impl Talk for Look {
 struct Thermocouple {
     spi: Oid,
     chip: Chip,
-    look: Slot<Conversation<Look>>,
+    look: JobSlot<Look>,
     rest_ticks: Ticks,
     min_value: u32,
     max_value: u32,
     max_invalid_count: u8,
     invalid_count: u8,
-    /// When the turn after the current look is due.
+    /// When the next read is due.
     next_clock: Clock,
 }
 
 impl Thermocouple {
-    fn check(&mut self, mcu: &Mcu, value: u32, fault: u8) -> Result<(), Shutdown> {
+    fn check(&mut self, context: &Context, value: u32, fault: u8) -> Result<(), Shutdown> {
         // This is Kalico's way to say that only the host checks the values.
-        if self.max_invalid_count == 0 && mcu.serves(since(Kalico)) {
+        if self.max_invalid_count == 0 && context.serves(since(Kalico)) {
             return Ok(());
         }
         if fault == 0 && (self.min_value..=self.max_value).contains(&value) {
@@ -179,7 +181,7 @@ impl Thermocouple {
             fault => Trouble::new(format!("the {name} reports fault bits 0x{fault:02x}, {times} times in a row"))
                 .remedy("check the sensor and its wires (klippy's log names the fault)"),
         };
-        mcu.try_shut_down(Shutdown::because(READER_FAULT, trouble))
+        context.try_shut_down(Shutdown::because(READER_FAULT, trouble))
     }
 }
 
@@ -188,44 +190,44 @@ impl Object for Thermocouple {
         "thermocouple"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
-        // A chip that is still being read misses this turn.
+        // A chip that is still being read misses this one.
         if self.look.is_here() {
             self.next_clock = next;
-            self.look.converse(turn, self.spi)?;
+            self.look.send_to(context, self.spi)?;
         }
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
         match result {
             Ok((value, fault)) => {
-                turn.send(Reading { oid: turn.oid(), next_clock: self.next_clock, value, fault });
-                self.check(turn, value, fault)
+                context.send(Reading { oid: context.oid(), next_clock: self.next_clock, value, fault });
+                self.check(context, value, fault)
             }
-            Err(error) => turn.try_shut_down(spi_shutdown(error.clone())),
+            Err(error) => context.try_shut_down(spi_shutdown(error.clone())),
         }
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.look.drop_pending();
     }
 }
 
 const CONFIG_THERMOCOUPLE: Command = command!(
     "config_thermocouple oid=%c spi_oid=%c thermocouple_type=%c",
-    |mcu, oid: Oid, spi_oid: Oid, thermocouple_type: u8| {
+    |context, oid: Oid, spi_oid: Oid, thermocouple_type: u8| {
         let Some((chip, _)) = Chip::ALL.get(usize::from(thermocouple_type)).copied() else {
             let what = format_args!("thermocouple_type {thermocouple_type} is none");
             return Err(Shutdown::by_host(INVALID_TYPE, what));
         };
-        mcu.require::<Spi>(spi_oid)?;
+        context.require::<Spi>(spi_oid)?;
         let object = Thermocouple {
             spi: spi_oid,
             chip,
-            look: Slot::talking(Look(chip)),
+            look: JobSlot::new(Look(chip)),
             rest_ticks: Ticks(0),
             min_value: 0,
             max_value: 0,
@@ -233,16 +235,16 @@ const CONFIG_THERMOCOUPLE: Command = command!(
             invalid_count: 0,
             next_clock: Clock::EPOCH,
         };
-        mcu.assign(oid, object)
+        context.assign(oid, object)
     }
 );
 
 const QUERY_THERMOCOUPLE: Command = command!(
     "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u max_invalid_count=%c",
     Thermocouple,
-    |sensor, turn, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         sensor.look.drop_pending();
         if rest_ticks == Ticks(0) {
             return Ok(());
@@ -252,7 +254,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
         sensor.max_value = max_value;
         sensor.max_invalid_count = max_invalid_count;
         sensor.invalid_count = 0;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 );
 

@@ -8,14 +8,14 @@
 
 use crate::board::{Bias, Direction, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Safe, Slot, Timer, Turn, WorkerId, command,
-    response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response,
+    Safe, Timer, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 
 use super::pace::Pace;
-use lines::Lines;
+use lines::{Lines, Wire};
 use port::Port;
 
 mod lines;
@@ -96,49 +96,49 @@ enum Way {
     Port(Port),
 }
 
-impl Way {
-    /// Lets nothing drive the wire low.
-    fn idle(&self) -> Result<(), Shutdown> {
-        match self {
-            Way::Lines(lines) => lines.idle(),
-            // A port is idle whenever it does not send.
-            Way::Port(_) => Ok(()),
-        }
-    }
-}
+impl Way {}
 
-/// Sends a message and receives its reply. Each UART has one box for them.
+/// Sends a message and receives its reply.
+#[derive(Default)]
 struct Exchange {
-    way: Way,
     message: Message,
+    warning: Option<DeviceWarning>,
 }
 
-impl Errand for Exchange {
-    type Answer = ();
+impl Job for Exchange {
+    type Device = Way;
+    type Out = ();
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<(), Shutdown> {
+    fn run(&mut self, way: &mut Way) -> Result<(), Shutdown> {
         self.message.replied = false;
-        match &mut self.way {
+        match way {
             Way::Lines(lines) => lines.exchange(&mut self.message),
             Way::Port(port) => {
                 port.exchange(&mut self.message);
+                self.warning = port.warning.take();
                 Ok(())
             }
         }
     }
+
+    fn take_warning(&mut self) -> Option<DeviceWarning> {
+        self.warning.take()
+    }
 }
 
 struct TmcUart {
-    worker: WorkerId,
+    way: DeviceId<Way>,
+    /// The wire, if no port drives it. A port is idle whenever it does not send.
+    wire: Option<Wire>,
     pace: Pace,
-    exchange: Slot<Exchange>,
+    exchange: JobSlot<Exchange>,
     /// Whether the host still expects an answer.
     asked: bool,
 }
 
 impl TmcUart {
-    fn send(&mut self, turn: &mut Turn, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
+    fn send(&mut self, context: &mut Context, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
         // As in the firmware: a busy UART ignores the command, and the host asks again.
         let Some(exchange) = self.exchange.here().filter(|_| !self.asked) else { return Ok(()) };
         let read_len = usize::from(read_len);
@@ -153,8 +153,8 @@ impl TmcUart {
         message.write_len = write.len();
         message.read_len = read_len;
         self.asked = true;
-        let at = turn.now() + QUIET;
-        turn.go_on(TIMER, at);
+        let at = context.now() + QUIET;
+        context.go_on(TIMER, at);
         Ok(())
     }
 }
@@ -165,85 +165,82 @@ impl Object for TmcUart {
     }
 
     /// Sends the message from a timer, so that no command waits for it.
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
-        self.exchange.send(turn, self.worker)?;
+    fn event(&mut self, context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+        self.exchange.send(context, self.way)?;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.exchange.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.exchange.back(finished) else { return Ok(()) };
         let result = result.map_err(Shutdown::clone);
         self.pace.resume();
         if std::mem::take(&mut self.asked)
             && result.is_ok()
             && let Some(exchange) = self.exchange.here()
         {
-            turn.send(UartResponse { oid: turn.oid(), read: exchange.message.reply() });
+            context.send(UartResponse { oid: context.oid(), read: exchange.message.reply() });
         }
         match result {
             Ok(()) => {
-                turn.is_safe();
+                context.is_safe();
                 Ok(())
             }
-            Err(failure) => turn.device_failed(self.kind(), failure),
+            Err(failure) => context.device_failed(self.kind(), failure),
         }
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.asked = false;
     }
 
-    /// Aborts a message under way. The errand then leaves the line idle.
-    fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
-        match self.exchange.here() {
-            Some(exchange) => exchange.way.idle().map(|()| Safe::Now),
-            None => {
-                self.pace.stop();
-                Ok(Safe::Later)
-            }
+    /// Aborts a message under way. The job then leaves the line idle.
+    fn make_safe(&mut self, _context: &mut Context) -> Result<Safe, Shutdown> {
+        if self.exchange.is_here() {
+            return self.wire.as_ref().map_or(Ok(()), Wire::idle).map(|()| Safe::Now);
         }
+        self.pace.stop();
+        Ok(Safe::Later)
     }
 }
 
 /// Claims two lines, or one for both directions.
-fn lines(mcu: &mut Mcu, rx_pin: Pin, tx_pin: Pin, bias: Bias, bit: Ticks) -> Result<Lines, Shutdown> {
-    let rx = mcu.prompt_line(rx_pin, "UART", Direction::Input(bias))?;
+fn lines(context: &mut Context, rx_pin: Pin, tx_pin: Pin, bias: Bias, bit: Ticks) -> Result<Lines, Shutdown> {
+    let rx = context.prompt_line(rx_pin, "UART", Direction::Input(bias))?;
     let (tx, single) = if rx_pin == tx_pin {
         (rx.clone(), Some(bias))
     } else {
         let idle = Direction::Output { level: true, shutdown_value: true };
-        (mcu.prompt_line(tx_pin, "UART", idle)?, None)
+        (context.prompt_line(tx_pin, "UART", idle)?, None)
     };
-    let lines = Lines { tx, rx, single, pace: Pace::new(mcu), bit, spoilt: false };
-    lines.idle()?;
+    let lines = Lines { wire: Wire { tx, single }, rx, pace: Pace::new(context), bit, spoilt: false };
+    lines.wire.idle()?;
     Ok(lines)
 }
 
 const CONFIG_TMCUART: Command = command!(
     "config_tmcuart oid=%c rx_pin=%u pull_up=%c tx_pin=%u bit_time=%u",
-    |mcu, oid: Oid, rx_pin: Pin, pull_up: bool, tx_pin: Pin, bit_time: Ticks| {
-        mcu.vacant(oid)?;
+    |context, oid: Oid, rx_pin: Pin, pull_up: bool, tx_pin: Pin, bit_time: Ticks| {
+        context.vacant(oid)?;
         // The resistors at a port's pins are those of the device tree.
-        let (worker, way, pace) = match mcu.board()?.serial(rx_pin, rate_hz(bit_time))? {
+        let (way, wire, pace) = match context.board()?.serial(rx_pin, rate_hz(bit_time))? {
             Some(_) if rx_pin != tx_pin => {
-                let (rx, tx) = (mcu.name(rx_pin), mcu.name(tx_pin));
+                let (rx, tx) = (context.name(rx_pin), context.name(tx_pin));
                 let cause = format!("it cannot receive on {rx} and send on {tx}, as a serial port does both");
                 return Err(Shutdown::because(reason::SERIAL_OPEN, cause).remedy("remove tx_pin"));
             }
             Some(OnWorker { bus, device }) => {
-                let port = Port::new(device, mcu.name(rx_pin), bit_time);
-                (mcu.worker(&bus)?, Way::Port(port), Pace::new(mcu))
+                let port = Port::new(device, context.name(rx_pin), bit_time);
+                (context.device(&bus, Box::new(Way::Port(port)))?, None, Pace::new(context))
             }
             None => {
                 let bias = if pull_up { Bias::PullUp } else { Bias::None };
-                let worker = mcu.worker(WORKER)?;
-                let lines = lines(mcu, rx_pin, tx_pin, bias, bit_time)?;
-                let pace = lines.pace.clone();
-                (worker, Way::Lines(lines), pace)
+                let lines = lines(context, rx_pin, tx_pin, bias, bit_time)?;
+                let (wire, pace) = (lines.wire.clone(), lines.pace.clone());
+                (context.device(WORKER, Box::new(Way::Lines(lines)))?, Some(wire), pace)
             }
         };
-        let exchange = Slot::new(Exchange { way, message: Message::default() });
-        mcu.assign_on(tx_pin, oid, TmcUart { worker, pace, exchange, asked: false })
+        let exchange = JobSlot::new(Exchange::default());
+        context.assign_on(tx_pin, oid, TmcUart { way, wire, pace, exchange, asked: false })
     }
 );
 
@@ -253,5 +250,5 @@ fn rate_hz(bit_time: Ticks) -> u32 {
 }
 
 const TMCUART_SEND: Command =
-    command!("tmcuart_send oid=%c write=%*s read=%c", TmcUart, |uart, turn, write: &[u8], read: u8| uart
-        .send(turn, write, read));
+    command!("tmcuart_send oid=%c write=%*s read=%c", TmcUart, |uart, context, write: &[u8], read: u8| uart
+        .send(context, write, read));

@@ -6,8 +6,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock,
-    command, response, since,
+    Command, Context, Enumeration, Feature, Generation::Master, Next, Object, Oid, Response, Timer, WireClock, command,
+    response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -116,24 +116,24 @@ pub(super) struct TriggerAnalog {
 
 impl TriggerAnalog {
     /// Processes a sample of the sensor, read at `at`.
-    fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+    fn update(&mut self, context: &mut Context, sample: i32, at: Clock) -> Result<(), Shutdown> {
         if !self.homing || self.awaits && at < self.homing_clock {
             return Ok(());
         }
         self.awaits = false;
         self.monitor_count = 0;
         if !(self.raw_min..=self.raw_max).contains(&sample) {
-            return self.fail(mcu, RAW_RANGE);
+            return self.fail(context, RAW_RANGE);
         }
-        let Ok(value) = mcu.with::<SosFilter, _>(self.filter, |filter, _| Ok(filter.apply(sample)))? else {
-            return self.fail(mcu, OVERFLOW);
+        let Ok(value) = context.with::<SosFilter, _>(self.filter, |filter, _| Ok(filter.apply(sample)))? else {
+            return self.fail(context, OVERFLOW);
         };
         if !self.crosses(value) {
             return Ok(());
         }
         self.homing = false;
         self.homing_clock = at;
-        self.pull(mcu, self.trigger_reason)
+        self.pull(context, self.trigger_reason)
     }
 
     /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as unsigned, except
@@ -151,16 +151,16 @@ impl TriggerAnalog {
     }
 
     /// Ends homing with an error.
-    fn fail(&mut self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
+    fn fail(&mut self, context: &mut Context, error: u8) -> Result<(), Shutdown> {
         if !std::mem::take(&mut self.homing) {
             return Ok(());
         }
-        self.pull(mcu, self.error_reason.wrapping_add(error))
+        self.pull(context, self.error_reason.wrapping_add(error))
     }
 
-    fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
+    fn pull(&self, context: &mut Context, reason: u8) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
-        mcu.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, reason))
+        context.with::<Trsync, _>(trsync, |trsync, context| trsync.trigger(context, reason))
     }
 }
 
@@ -171,12 +171,12 @@ impl Object for TriggerAnalog {
 
     /// Checks whether the sensor is silent, and pulls the trigger if it is. Later samples are still checked, as in the
     /// firmware: a trsync is pulled only once.
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if !self.homing {
             return Ok(Next::Done);
         }
         if self.monitor_count > self.monitor_max {
-            self.pull(turn, self.error_reason.wrapping_add(MONITOR))?;
+            self.pull(context, self.error_reason.wrapping_add(MONITOR))?;
             return Ok(Next::Done);
         }
         self.monitor_count = self.monitor_count.wrapping_add(1);
@@ -197,41 +197,45 @@ pub(super) enum Attached {
 
 impl Attached {
     /// Attaches an analog trigger.
-    pub(super) fn attach(&mut self, mcu: &mut Mcu, trigger_analog: Oid) -> Result<(), Shutdown> {
-        mcu.require::<TriggerAnalog>(trigger_analog)?;
+    pub(super) fn attach(&mut self, context: &mut Context, trigger_analog: Oid) -> Result<(), Shutdown> {
+        context.require::<TriggerAnalog>(trigger_analog)?;
         *self = Attached::Trigger(trigger_analog);
         Ok(())
     }
 
     /// Attaches a load cell probe.
-    pub(super) fn attach_probe(&mut self, mcu: &mut Mcu, probe: Oid) -> Result<(), Shutdown> {
-        mcu.require::<LoadCellProbe>(probe)?;
+    pub(super) fn attach_probe(&mut self, context: &mut Context, probe: Oid) -> Result<(), Shutdown> {
+        context.require::<LoadCellProbe>(probe)?;
         *self = Attached::Probe(probe);
         Ok(())
     }
 
     /// Passes on a sample that was read at `at`.
-    pub(super) fn update(self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+    pub(super) fn update(self, context: &mut Context, sample: i32, at: Clock) -> Result<(), Shutdown> {
         match self {
             Attached::Nothing => Ok(()),
             Attached::Trigger(oid) => {
-                mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| trigger.update(turn, sample, at))
+                context.with::<TriggerAnalog, _>(oid, |trigger, context| trigger.update(context, sample, at))
             }
-            Attached::Probe(oid) => mcu.with::<LoadCellProbe, _>(oid, |probe, turn| probe.update(turn, sample, at)),
+            Attached::Probe(oid) => {
+                context.with::<LoadCellProbe, _>(oid, |probe, context| probe.update(context, sample, at))
+            }
         }
     }
 
     /// Passes on an error of the sensor, by the sensor's own number. (A load cell probe gets no errors: it notices that
     /// samples are missing.)
-    pub(super) fn note_error(self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
+    pub(super) fn note_error(self, context: &mut Context, error: u8) -> Result<(), Shutdown> {
         let Attached::Trigger(oid) = self else { return Ok(()) };
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| trigger.fail(turn, error.wrapping_add(SENSOR_SPECIFIC)))
+        context.with::<TriggerAnalog, _>(oid, |trigger, context| {
+            trigger.fail(context, error.wrapping_add(SENSOR_SPECIFIC))
+        })
     }
 }
 
 const CONFIG_TRIGGER_ANALOG: Command =
-    command!("config_trigger_analog oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
-        mcu.require::<SosFilter>(sos_filter_oid)?;
+    command!("config_trigger_analog oid=%c sos_filter_oid=%c", |context, oid: Oid, sos_filter_oid: Oid| {
+        context.require::<SosFilter>(sos_filter_oid)?;
         let trigger = TriggerAnalog {
             filter: sos_filter_oid,
             raw_min: 0,
@@ -249,7 +253,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
             monitor_max: 0,
             monitor_count: 0,
         };
-        mcu.assign(oid, trigger)
+        context.assign(oid, trigger)
     })
     .of(since(Master));
 
@@ -279,21 +283,21 @@ const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
     TriggerAnalog,
     |trigger,
-     turn,
+     context,
      trsync_oid: Oid,
      trigger_reason: u8,
      error_reason: u8,
      clock: WireClock,
      monitor_ticks: Ticks,
      monitor_max: u32| {
-        let at = turn.instant(clock);
+        let at = context.instant(clock);
         if monitor_ticks == Ticks(0) {
-            turn.cancel(TIMER);
+            context.cancel(TIMER);
             (trigger.homing, trigger.trsync) = (false, None);
             return Ok(());
         }
-        turn.require::<Trsync>(trsync_oid)?;
-        turn.cancel(TIMER);
+        context.require::<Trsync>(trsync_oid)?;
+        context.cancel(TIMER);
         trigger.monitor_ticks = monitor_ticks;
         trigger.trsync = Some(trsync_oid);
         trigger.trigger_reason = trigger_reason;
@@ -305,14 +309,14 @@ const TRIGGER_ANALOG_HOME: Command = command!(
         trigger.homing = true;
         trigger.awaits = true;
         trigger.peak = i32::MIN;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 )
 .of(since(Master));
 
 const TRIGGER_ANALOG_QUERY_STATE: Command =
-    command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, turn| {
-        turn.send(State { oid: turn.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
+    command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, context| {
+        context.send(State { oid: context.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
         Ok(())
     })
     .of(since(Master));

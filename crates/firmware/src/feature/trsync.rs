@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response};
+use crate::mcu::{Command, Context, Feature, Next, Object, Oid, Response, Timer, WireClock, command, response};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
@@ -43,56 +43,61 @@ const EXPIRE: Timer = Timer::exact(1);
 
 impl Trsync {
     /// Pulls the trigger, unless it was pulled before. Calls every waiting object, and reports to the host.
-    pub(super) fn trigger(&mut self, turn: &mut Turn, reason: u8) -> Result<(), Shutdown> {
-        if self.pull(turn, reason)? {
-            self.report(turn);
+    pub(super) fn trigger(&mut self, context: &mut Context, reason: u8) -> Result<(), Shutdown> {
+        if self.pull(context, reason)? {
+            self.report(context);
         }
         Ok(())
     }
 
     /// Pulls the trigger without a report to the host. False if it was pulled before.
-    fn pull(&mut self, mcu: &mut Mcu, reason: u8) -> Result<bool, Shutdown> {
+    fn pull(&mut self, context: &mut Context, reason: u8) -> Result<bool, Shutdown> {
         let pulled = std::mem::take(&mut self.can_trigger);
         if pulled {
             self.trigger_reason = reason;
             while let Some(signal) = self.signals.pop() {
-                mcu.trigger(signal)?;
+                context.trigger(signal)?;
             }
         }
         Ok(pulled)
     }
 
-    fn report(&self, turn: &mut Turn) {
-        let clock = turn.now();
-        turn.send(State { oid: turn.oid(), can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
+    fn report(&self, context: &mut Context) {
+        let clock = context.now();
+        context.send(State {
+            oid: context.oid(),
+            can_trigger: self.can_trigger,
+            trigger_reason: self.trigger_reason,
+            clock,
+        });
     }
 
-    /// Adds the object whose turn it is to the objects that wait for the trigger.
+    /// Adds the object of this context to the objects that wait for the trigger.
     ///
     /// # Errors
     ///
     /// "Can't add signal that is already active" if it waits for one already, "Invalid oid type".
-    pub(super) fn add_signal(turn: &mut Turn, trsync: Oid) -> Result<(), Shutdown> {
-        let waiting = turn.oid();
-        if turn.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
+    pub(super) fn add_signal(context: &mut Context, trsync: Oid) -> Result<(), Shutdown> {
+        let waiting = context.oid();
+        if context.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
             return Err(Shutdown::by_host(SIGNAL_ACTIVE, "it already waits for a trigger"));
         }
-        turn.with::<Trsync, _>(trsync, |trsync, _| {
+        context.with::<Trsync, _>(trsync, |trsync, _| {
             trsync.signals.push(waiting);
             Ok(())
         })
     }
 
-    /// Whether this trsync can still be triggered, and the object whose turn it is waits for it.
-    pub(super) fn may_stop(turn: &mut Turn, trsync: Oid) -> bool {
-        let waiting = turn.oid();
-        let may = |trsync: &mut Trsync, _: &mut Turn| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
-        turn.with::<Trsync, _>(trsync, may).unwrap_or(false)
+    /// Whether this trsync can still be triggered, and the object of this context waits for it.
+    pub(super) fn may_stop(context: &mut Context, trsync: Oid) -> bool {
+        let waiting = context.oid();
+        let may = |trsync: &mut Trsync, _: &mut Context| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
+        context.with::<Trsync, _>(trsync, may).unwrap_or(false)
     }
 
-    fn clear(&mut self, turn: &mut Turn) {
-        turn.cancel(REPORT);
-        turn.cancel(EXPIRE);
+    fn clear(&mut self, context: &mut Context) {
+        context.cancel(REPORT);
+        context.cancel(EXPIRE);
         self.signals.clear();
         self.can_trigger = false;
         self.trigger_reason = 0;
@@ -105,21 +110,21 @@ impl Object for Trsync {
         "trsync"
     }
 
-    fn event(&mut self, turn: &mut Turn, timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if timer == EXPIRE {
-            self.trigger(turn, self.expire_reason)?;
+            self.trigger(context, self.expire_reason)?;
             return Ok(Next::Done);
         }
-        self.report(turn);
+        self.report(context);
         Ok(Next::At(at + self.report_ticks))
     }
 
-    fn shutdown(&mut self, turn: &mut Turn) {
-        self.clear(turn);
+    fn shutdown(&mut self, context: &mut Context) {
+        self.clear(context);
     }
 }
 
-const CONFIG_TRSYNC: Command = command!("config_trsync oid=%c", |mcu, oid: Oid| {
+const CONFIG_TRSYNC: Command = command!("config_trsync oid=%c", |context, oid: Oid| {
     let trsync = Trsync {
         can_trigger: false,
         report_ticks: Ticks(0),
@@ -127,41 +132,41 @@ const CONFIG_TRSYNC: Command = command!("config_trsync oid=%c", |mcu, oid: Oid| 
         expire_reason: 0,
         signals: Vec::with_capacity(SIGNALS_MAX),
     };
-    mcu.assign(oid, trsync)
+    context.assign(oid, trsync)
 });
 
 const TRSYNC_START: Command = command!(
     "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c",
     Trsync,
-    |trsync, turn, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
-        let report_at = turn.instant(report_clock);
-        trsync.clear(turn);
+    |trsync, context, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
+        let report_at = context.instant(report_clock);
+        trsync.clear(context);
         trsync.can_trigger = true;
         trsync.report_ticks = report_ticks;
         trsync.expire_reason = expire_reason;
         match report_ticks {
             Ticks(0) => Ok(()),
-            _ => turn.schedule(REPORT, report_at),
+            _ => context.schedule(REPORT, report_at),
         }
     }
 );
 
 const TRSYNC_SET_TIMEOUT: Command =
-    command!("trsync_set_timeout oid=%c clock=%u", Trsync, |trsync, turn, clock: WireClock| {
-        let expire_at = turn.instant(clock);
+    command!("trsync_set_timeout oid=%c clock=%u", Trsync, |trsync, context, clock: WireClock| {
+        let expire_at = context.instant(clock);
         if !trsync.can_trigger {
             return Ok(());
         }
-        turn.cancel(EXPIRE);
-        turn.schedule(EXPIRE, expire_at)
+        context.cancel(EXPIRE);
+        context.schedule(EXPIRE, expire_at)
     });
 
-const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", Trsync, |trsync, turn, reason: u8| {
-    trsync.pull(turn, reason)?;
-    turn.cancel(REPORT);
-    turn.cancel(EXPIRE);
+const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", Trsync, |trsync, context, reason: u8| {
+    trsync.pull(context, reason)?;
+    context.cancel(REPORT);
+    context.cancel(EXPIRE);
     let trigger_reason = trsync.trigger_reason;
     // The host itself pulled the trigger and does not need to know when. The clock is 0, as in the firmware.
-    turn.send(State { oid: turn.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
+    context.send(State { oid: context.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
     Ok(())
 });

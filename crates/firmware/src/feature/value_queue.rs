@@ -4,7 +4,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Mcu, MoveQueue, Next, Timer, Turn};
+use crate::mcu::{Context, MoveQueue, Next, Timer};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::{Clock, Ticks};
 
@@ -51,22 +51,22 @@ impl ValueQueue {
     }
 
     /// Appends a value. If it is the only one, the timer of the object takes it at `at`.
-    pub(super) fn queue(&mut self, turn: &mut Turn, at: Clock, value: u16) -> Result<(), Shutdown> {
+    pub(super) fn queue(&mut self, context: &mut Context, at: Clock, value: u16) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
-        self.queue.push(&mut turn.moves, Move { at, value })?;
+        self.queue.push(context.moves(), Move { at, value })?;
         if !first {
             return Ok(());
         }
         if self.end.take().is_some_and(|end| end < at) {
             return Err(changes_too_late(self.texts.max_duration, self.max_duration));
         }
-        turn.cancel(TIMER);
-        turn.schedule(TIMER, at)
+        context.cancel(TIMER);
+        context.schedule(TIMER, at)
     }
 
     /// Takes the value that is due.
-    pub(super) fn pop(&mut self, mcu: &mut Mcu) -> Result<u16, Shutdown> {
-        let due = self.queue.pop(&mut mcu.moves);
+    pub(super) fn pop(&mut self, context: &mut Context) -> Result<u16, Shutdown> {
+        let due = self.queue.pop(context.moves());
         due.map(|due| due.value).ok_or_else(|| not_refreshed(self.texts.missed, self.max_duration).late_for(self.end))
     }
 
@@ -85,8 +85,8 @@ impl ValueQueue {
     }
 
     /// Forgets all values when the MCU stops.
-    pub(super) fn clear(&mut self, mcu: &mut Mcu) {
+    pub(super) fn clear(&mut self, context: &mut Context) {
         self.end = None;
-        self.queue.clear(&mut mcu.moves);
+        self.queue.clear(context.moves());
     }
 }

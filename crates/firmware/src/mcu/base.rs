@@ -131,47 +131,48 @@ pub fn identify_response(dictionary: &[u8], offset: u32, count: u8) -> IdentifyR
     IdentifyResponse { offset, data: &dictionary[start..end] }
 }
 
-const IDENTIFY: Command = command!("identify offset=%u count=%c", |mcu, offset: u32, count: u8| {
+const IDENTIFY: Command = command!("identify offset=%u count=%c", |mcu: &mut Mcu, offset: u32, count: u8| {
     let dialect = mcu.heard().clone();
-    mcu.send(identify_response(dialect.compressed(), offset, count));
+    mcu.state.wire.send(identify_response(dialect.compressed(), offset, count));
     Ok(())
 })
 .allowed_in_shutdown();
 
-const GET_CLOCK: Command = command!("get_clock", |mcu| {
+const GET_CLOCK: Command = command!("get_clock", |mcu: &mut Mcu| {
     let clock = mcu.now();
-    mcu.send(ClockResponse { clock });
+    mcu.state.wire.send(ClockResponse { clock });
     Ok(())
 })
 .allowed_in_shutdown();
 
-const GET_UPTIME: Command = command!("get_uptime", |mcu| {
+const GET_UPTIME: Command = command!("get_uptime", |mcu: &mut Mcu| {
     let uptime = Uptime::from(mcu.now());
-    mcu.send(uptime);
+    mcu.state.wire.send(uptime);
     Ok(())
 })
 .allowed_in_shutdown();
 
-const GET_CONFIG: Command = command!("get_config", |mcu| {
+const GET_CONFIG: Command = command!("get_config", |mcu: &mut Mcu| {
     let config = Config {
         is_config: mcu.is_finalized(),
         // klippy resets an MCU with another configuration before it sends anything else.
-        crc: if mcu.spoken.next.is_some() { !mcu.configuration.crc } else { mcu.configuration.crc },
+        crc: if mcu.state.wire.is_foreign() { !mcu.state.phase.crc() } else { mcu.state.phase.crc() },
         is_shutdown: mcu.is_shutdown(),
-        move_count: mcu.moves.count,
+        move_count: mcu.state.moves.count(),
     };
-    mcu.send(config);
+    mcu.state.wire.send(config);
     Ok(())
 })
 .allowed_in_shutdown();
 
-const ALLOCATE_OIDS: Command = command!("allocate_oids count=%c", |mcu, count: u8| mcu.allocate_oids(count));
+const ALLOCATE_OIDS: Command = command!("allocate_oids count=%c", |mcu: &mut Mcu, count: u8| mcu.allocate_oids(count));
 
-const FINALIZE_CONFIG: Command = command!("finalize_config crc=%u", |mcu, crc: u32| mcu.finalize(crc));
+const FINALIZE_CONFIG: Command = command!("finalize_config crc=%u", |mcu: &mut Mcu, crc: u32| mcu.finalize(crc));
 
-const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowed_in_shutdown();
+const CONFIG_RESET: Command = command!("config_reset", |mcu: &mut Mcu| mcu.reset()).allowed_in_shutdown();
 
-pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
+pub(super) const EMERGENCY_STOP: Command =
+    command!("emergency_stop", |_mcu: &mut Mcu| Err(emergency())).allowed_in_shutdown();
 
 /// The shutdown that `emergency_stop` causes.
 pub fn emergency() -> Shutdown {
@@ -179,27 +180,28 @@ pub fn emergency() -> Shutdown {
         .remedy("see klippy.log for the cause, then FIRMWARE_RESTART")
 }
 
-const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu| mcu.clear_shutdown()).allowed_in_shutdown();
+const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu: &mut Mcu| mcu.clear_shutdown()).allowed_in_shutdown();
 
-const DEBUG_NOP: Command = command!("debug_nop", |_mcu| Ok(())).allowed_in_shutdown();
+const DEBUG_NOP: Command = command!("debug_nop", |_mcu: &mut Mcu| Ok(())).allowed_in_shutdown();
 
-const DEBUG_PING: Command = command!("debug_ping data=%*s", |mcu, data: &[u8]| {
-    mcu.send(Pong { data });
+const DEBUG_PING: Command = command!("debug_ping data=%*s", |mcu: &mut Mcu, data: &[u8]| {
+    mcu.state.wire.send(Pong { data });
     Ok(())
 })
 .allowed_in_shutdown();
 
-const DEBUG_READ: Command = command!("debug_read order=%c addr=%u", |_mcu, order: u8, addr: u32| {
+const DEBUG_READ: Command = command!("debug_read order=%c addr=%u", |_mcu: &mut Mcu, order: u8, addr: u32| {
     let _ = (order, addr);
     Err(debug_refused("debug_read"))
 })
 .allowed_in_shutdown();
 
-const DEBUG_WRITE: Command = command!("debug_write order=%c addr=%u val=%u", |_mcu, order: u8, addr: u32, val: u32| {
-    let _ = (order, addr, val);
-    Err(debug_refused("debug_write"))
-})
-.allowed_in_shutdown();
+const DEBUG_WRITE: Command =
+    command!("debug_write order=%c addr=%u val=%u", |_mcu: &mut Mcu, order: u8, addr: u32, val: u32| {
+        let _ = (order, addr, val);
+        Err(debug_refused("debug_write"))
+    })
+    .allowed_in_shutdown();
 
 fn debug_refused(command: &str) -> Shutdown {
     let cause = format!("the host sent {command}: a process of Linux does not poke memory for a host");

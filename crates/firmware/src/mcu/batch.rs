@@ -12,7 +12,7 @@ use std::ptr;
 use crate::board::Bank;
 use crate::time::Clock;
 
-use super::Mcu;
+use super::{Mcu, State};
 
 /// Edges that go out together.
 pub struct Batch {
@@ -47,9 +47,9 @@ impl Mcu {
     pub(super) fn run_batch(&mut self) {
         let Some(at) = self.next_timer() else { return };
         let mut batch = Batch { now: self.last_read(), bank: None, high: 0, low: 0 };
-        let objects = &mut self.configuration.objects;
-        let joining = self.schedule.timers.of_instant(at).take_while(|timer| {
-            let object = timer.oid().and_then(|oid| objects.get_mut(oid.index())?.as_mut());
+        let State { scheduler, objects, .. } = &mut self.state;
+        let joining = scheduler.of_instant(at).take_while(|timer| {
+            let object = timer.oid().and_then(|oid| objects.get_mut(oid));
             object.is_some_and(|object| object.join(&mut batch))
         });
         let count = joining.count();

@@ -1,29 +1,23 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Conversations with chips on a bus.
+//! Chips on a bus.
 //!
-//! An object, for example an SPI device, represents a chip and lends it to other objects. A sensor that talks to the
-//! chip learns the oid of the SPI device at configuration. It borrows the chip only while it talks, because klippy
-//! configures the sensor before it sets the SPI device's bus.
+//! An object, for example an SPI device, represents a chip. A sensor that uses the chip learns the oid of the SPI
+//! device at configuration. It asks that object for the chip when it sends a job, because klippy configures the sensor
+//! before it sets the SPI device's bus.
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex, PoisonError};
-
-use crate::board::{BusDevice, BusError, BusStatus, OnWorker};
+use crate::board::{BusDevice, BusError, OnWorker};
 use crate::shutdown::Shutdown;
-use crate::trouble::Trouble;
 
-use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
+use super::{BusCounts, Calls, Context, DeviceId, Job, JobSlot, Oid};
 
-/// A chip that several conversations use in turn. They all run on the worker of its bus, one after the other. So the
-/// lock is always free. The core never takes it.
-type SharedDevice = Arc<Mutex<Box<dyn BusDevice>>>;
+/// A chip as the device of a job.
+pub type Chip = dyn BusDevice;
 
-/// A chip and the worker of its bus.
-#[derive(Clone)]
+/// A chip on a bus, and the count of its transfers.
 pub struct Bus {
-    worker: WorkerId,
-    device: SharedDevice,
+    chip: DeviceId<Chip>,
     calls: Calls,
 }
 
@@ -51,74 +45,24 @@ impl BusDevice for Counted {
     }
 }
 
-/// The code of a conversation with a chip. It runs on the worker and may block there.
-pub trait Talk: Send + 'static {
-    /// The result of the conversation.
-    type Answer: Copy + Send;
-
-    /// Runs the conversation.
-    ///
-    /// # Errors
-    ///
-    /// The errors of the calls to `chip`.
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Self::Answer, BusError>;
-}
-
-/// A conversation with a chip, as an [`Errand`].
-pub struct Conversation<T> {
-    /// The code of the conversation.
-    pub talk: T,
-    /// Set when the conversation is sent.
-    device: Option<SharedDevice>,
-}
-
-impl<T: Talk> Errand for Conversation<T> {
-    type Answer = T::Answer;
-    type Failure = BusError;
-
-    fn run(&mut self) -> Result<T::Answer, BusError> {
-        let device = self.device.take().ok_or_else(no_device)?;
-        let mut chip = device.lock().unwrap_or_else(PoisonError::into_inner);
-        self.talk.talk(&mut **chip)
-    }
-}
-
-impl<T: Talk> Slot<Conversation<T>> {
-    /// Creates a slot for conversations. This allocates, so objects call it at configuration.
-    pub fn talking(talk: T) -> Slot<Conversation<T>> {
-        Slot::new(Conversation { talk, device: None })
-    }
-
-    /// Sends the conversation, if it is here, to the chip that object `device` represents.
+impl<J: Job<Device = Chip>> JobSlot<J> {
+    /// Sends the job, if it is here, to the chip that object `device` represents.
     ///
     /// # Errors
     ///
     /// "Invalid oid type" if the object represents no chip, "Bus worker queue overflow".
-    pub fn converse(&mut self, turn: &mut Turn, device: Oid) -> Result<(), Shutdown> {
-        let bus = turn.lend(device)?;
-        self.converse_on(turn, &bus)
+    pub fn send_to(&mut self, context: &mut Context, device: Oid) -> Result<(), Shutdown> {
+        let chip = context.state.lend(device)?;
+        self.send(context, chip)
     }
-
-    /// The same, for the object that represents the chip itself.
-    ///
-    /// # Errors
-    ///
-    /// "Bus worker queue overflow".
-    pub fn converse_on(&mut self, turn: &mut Turn, bus: &Bus) -> Result<(), Shutdown> {
-        if let Some(conversation) = self.here() {
-            conversation.device = Some(bus.device.clone());
-        }
-        self.send(turn, bus.worker)
-    }
-}
-
-/// The error for a conversation without a chip. [`Slot::converse_on`] always sets the chip.
-#[cold]
-fn no_device() -> BusError {
-    BusError::new(BusStatus::Nack, Trouble::new("it was sent without a chip").remedy("please report it"))
 }
 
 impl Bus {
+    /// The chip, for a job.
+    pub fn chip(&self) -> DeviceId<Chip> {
+        self.chip
+    }
+
     /// The transfers to and from this chip.
     pub(super) fn counts(&self) -> BusCounts {
         self.calls.counts()
@@ -129,16 +73,16 @@ impl Bus {
 /// worker runs them all.
 const SOFTWARE: &str = "software";
 
-impl Mcu {
+impl Context<'_> {
     /// A chip that the board has opened.
     ///
     /// # Errors
     ///
     /// An error if the worker cannot be started.
     pub fn bus(&mut self, OnWorker { bus, device }: OnWorker<dyn BusDevice>) -> Result<Bus, Shutdown> {
-        let (worker, calls) = (self.worker(&bus)?, Calls::new(self.clock()));
-        let counted = Counted { device, calls: calls.clone() };
-        Ok(Bus { worker, device: Arc::new(Mutex::new(Box::new(counted))), calls })
+        let calls = Calls::new(self.clock());
+        let chip: Box<Chip> = Box::new(Counted { device, calls: calls.clone() });
+        Ok(Bus { chip: self.device(&bus, chip)?, calls })
     }
 
     /// A device on a software bus, made of GPIO lines.

@@ -49,8 +49,8 @@ impl Command {
         self
     }
 
-    /// Lets the command run while other commands wait for an errand of the same kind of command. Their object must [let
-    /// others join](super::Turn::let_join). The first parameter must be the oid.
+    /// Lets the command run while other commands wait for a job of the same kind of command. Their object must [let
+    /// others join](super::Context::let_join). The first parameter must be the oid.
     pub const fn joining(mut self) -> Command {
         self.joins = true;
         self
@@ -169,13 +169,21 @@ impl Feature {
     };
 }
 
-/// Declares a command: its format, and a closure with the MCU and the typed parameters.
+/// Declares a command: its format, and a closure with the [`Context`](crate::mcu::Context) and the typed parameters.
 ///
 /// A command to an object names the object's type after the format. Its first parameter is the object's `oid`. Its
-/// closure gets the object and its [`Turn`](crate::mcu::Turn) in place of the MCU and the oid.
+/// closure gets the object in front of the context, and no oid. A closure with `mcu: &mut Mcu` is for the MCU's own
+/// commands.
 #[macro_export]
 macro_rules! command {
-    ($format:literal, |$mcu:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
+    ($format:literal, |$context:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {
+        $crate::command!($format, |mcu: &mut Mcu $(, $arg: $t)*| {
+            let $context = &mut mcu.context();
+            #[allow(unused_braces)]
+            $body
+        })
+    };
+    ($format:literal, |$mcu:ident: &mut Mcu $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
         $crate::command!(@agrees $format $(, $arg: $t)*);
         fn handler(
             $mcu: &mut $crate::mcu::Mcu,
@@ -187,7 +195,7 @@ macro_rules! command {
         }
         $crate::mcu::Command::new($format, handler)
     }};
-    ($format:literal, $object:ty, |$own:ident, $turn:tt $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
+    ($format:literal, $object:ty, |$own:ident, $context:tt $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
         $crate::command!(@agrees $format, oid: $crate::mcu::Oid $(, $arg: $t)*);
         fn handler(
             mcu: &mut $crate::mcu::Mcu,
@@ -195,7 +203,7 @@ macro_rules! command {
         ) -> Result<(), $crate::shutdown::Shutdown> {
             let oid = <$crate::mcu::Oid as $crate::protocol::format::Arg>::decode(args)?;
             $(let $arg = <$t as $crate::protocol::format::Arg>::decode(args)?;)*
-            mcu.with::<$object, _>(oid, |$own, $turn| $body)
+            mcu.context().with::<$object, _>(oid, |$own, $context| $body)
         }
         $crate::mcu::Command::new($format, handler)
     }};

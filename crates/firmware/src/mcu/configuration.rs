@@ -3,113 +3,70 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::Pin;
-use crate::shutdown::{Shutdown, reason};
+use crate::shutdown::Shutdown;
 
-use super::lines::Claim;
-use super::stop::Stop;
-use super::{Mcu, MovePool, Note, Object, Oid, TimerId};
-
-/// Highest number of objects with an oid.
-pub(super) const OBJECTS_MAX: usize = 256;
-
-/// The host's configuration.
-#[derive(Default)]
-pub(super) struct Configuration {
-    /// Indexed by oid; feature-owned objects follow.
-    pub(super) objects: Vec<Option<Box<dyn Object>>>,
-    /// The count of `allocate_oids`; `None` before that command.
-    pub(super) oid_count: Option<usize>,
-    /// The objects that the log names by a pin.
-    pub(super) pins: Vec<(Oid, Pin)>,
-    /// The GPIO lines in use.
-    pub(super) claims: Vec<Claim>,
-    /// The checksum of `finalize_config`.
-    pub(super) crc: u32,
-    /// Whether a `config_reset` waits for outputs to be at their shutdown values.
-    pub(super) reset_due: bool,
-}
+use super::{Mcu, Note, TimerId};
 
 impl Mcu {
     /// Whether the MCU is configured and not stopped.
     #[inline]
     pub fn is_running(&self) -> bool {
-        self.is_finalized() && self.stop.reason.is_none()
+        self.state.phase.is_running()
     }
 
     /// Whether the configuration is complete.
     pub fn is_finalized(&self) -> bool {
-        self.moves.count != 0
-    }
-
-    /// Whether a host has begun to configure the MCU.
-    pub(super) fn is_allocated(&self) -> bool {
-        self.configuration.oid_count.is_some()
+        self.state.phase.is_finalized()
     }
 
     pub(super) fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {
-        if self.is_allocated() {
-            let cause = "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed";
-            return Err(Shutdown::because(reason::OIDS_ALLOCATED, cause).remedy("FIRMWARE_RESTART"));
-        }
         let count = usize::from(count);
-        self.configuration.oid_count = Some(count);
-        let objects = &mut self.configuration.objects;
-        if objects.len() < count {
-            objects.resize_with(count, || None);
-        }
+        self.state.phase.allocate(count)?;
+        self.state.objects.allocate(count);
         Ok(())
     }
 
     pub(super) fn finalize(&mut self, crc: u32) -> Result<(), Shutdown> {
-        if self.is_finalized() {
-            return Err(Shutdown::by_host(reason::ALREADY_FINALIZED, "finalize_config came twice"));
-        }
-        self.moves.finalize();
-        self.configuration.crc = crc;
+        let state = &mut self.state;
+        state.phase.finalize(crc)?;
+        state.moves.finalize();
         // The core does not allocate after this.
-        self.schedule.reserve();
-        self.schedule.has_banks = self.configuration.claims.iter().any(Claim::is_in_bank);
+        state.scheduler.finalize(state.lines.has_banks());
         let mut kinds: Vec<(&'static str, usize)> = Vec::new();
-        for object in self.configuration.objects.iter().flatten() {
+        for object in state.objects.iter() {
             match kinds.iter_mut().find(|(kind, _)| *kind == object.kind()) {
                 Some((_, count)) => *count += 1,
                 None => kinds.push((object.kind(), 1)),
             }
         }
-        self.outbox.note(Note::Configured(&kinds));
+        state.wire.note(Note::Configured(&kinds));
         Ok(())
     }
 
     /// Forgets the configuration as soon as every output is at its shutdown value. After that, nothing would try to
     /// drive an output to it. No command runs until then.
     pub(super) fn reset(&mut self) -> Result<(), Shutdown> {
-        if !self.is_shutdown() {
-            return Err(Shutdown::by_host(
-                reason::CONFIG_RESET_RUNNING,
-                "config_reset came without an emergency_stop before it",
-            ));
-        }
-        self.configuration.reset_due = true;
+        self.state.phase.request_reset()?;
         self.reset_if_due();
         Ok(())
     }
 
     pub(super) fn reset_if_due(&mut self) {
-        if !self.configuration.reset_due || self.owes() {
+        let state = &mut self.state;
+        if !state.phase.is_reset_due() || state.pending.are_awaited() {
             return;
         }
-        self.stop = Stop::default();
-        self.schedule.timers.clear();
-        self.schedule.timers.remove(TimerId::HOLD);
-        self.workers.reset();
-        self.holds.count = 0;
-        self.configuration = Configuration::default();
-        self.board.reset();
-        self.moves = MovePool::default();
-        if let Some(dialect) = self.spoken.next.take() {
-            self.spoken.dialect = dialect;
-        }
-        self.outbox.note(Note::Reset);
+        state.phase = Default::default();
+        state.pending = Default::default();
+        state.scheduler.clear();
+        state.scheduler.cancel(TimerId::HOLD);
+        state.workers.reset();
+        state.barrier = Default::default();
+        state.objects = Default::default();
+        state.lines = Default::default();
+        state.board.reset();
+        state.moves = Default::default();
+        state.wire.take_next();
+        state.wire.note(Note::Reset);
     }
 }

@@ -147,12 +147,12 @@ impl Firmware {
 /// A dictionary that describes the program and has no messages yet.
 fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
     let hosts = since(Generation::V0_13);
-    let is_told = name.generations().iter().any(|generation| hosts.contains(*generation));
-    let told = |text: &str| if is_told { text.to_owned() } else { String::new() };
+    let is_named = name.generations().iter().any(|generation| hosts.contains(*generation));
+    let named = |text: &str| if is_named { text.to_owned() } else { String::new() };
     Dictionary {
-        app: told(firmware.app),
+        app: named(firmware.app),
         build_versions: firmware.build_versions.into(),
-        license: told(firmware.license),
+        license: named(firmware.license),
         version: firmware.version.into(),
         ..Dictionary::default()
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! GPIO lines: the table of claims, and the outputs and inputs that objects use.
+//! GPIO lines: the table of claims, and how features claim a line.
 //!
 //! Several objects may use one line, as in the firmware, which sets the line up again. Examples:
 //!
@@ -11,80 +11,251 @@
 
 #![forbid(unsafe_code)]
 
-use std::mem;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
 
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
-use crate::time::Clock;
 
-use super::snapshot::Level;
-use super::{
-    Back, Batch, Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Slot, Turn, UNREAD_LIMIT, Unread,
-    WorkerId,
-};
+use super::outputs::Output;
+use super::{Calls, Context, DeviceId, InputLine, LineState, OutputLine, PromptLine, Settable, State};
+
+/// The GPIO lines in use.
+#[derive(Default)]
+pub(super) struct Lines {
+    claims: Vec<Claim>,
+}
+
+impl Lines {
+    pub(super) fn len(&self) -> usize {
+        self.claims.len()
+    }
+
+    /// The state of the line at this place, for the MCU's status.
+    pub(super) fn state(&self, place: usize) -> LineState {
+        self.claims[place].state()
+    }
+
+    /// Whether a line is in a bank.
+    pub(super) fn has_banks(&self) -> bool {
+        self.claims.iter().any(|claim| claim.line.bank().is_some())
+    }
+
+    pub(super) fn get(&self, place: usize) -> Option<&Claim> {
+        self.claims.get(place)
+    }
+
+    pub(super) fn output_mut(&mut self, place: usize) -> Option<&mut Output> {
+        self.claims.get_mut(place)?.output.as_mut()
+    }
+
+    fn find(&self, pin: Pin) -> Option<usize> {
+        self.claims.iter().position(|claim| claim.pin == pin)
+    }
+}
 
 /// A line in use.
 pub(super) struct Claim {
     /// The board's own number for it.
     pin: Pin,
     line: Arc<dyn Line>,
-    /// The worker of its chip and the worker's calls, if calls to that chip may be slow.
-    slow: Option<(WorkerId, Calls)>,
-    /// Its last setup.
+    /// The line in the worker of its chip and the worker's calls, if calls to that chip may be slow.
+    slow: Option<(DeviceId<Repeated>, Calls)>,
+    /// Its last setup, with the shutdown value of an output.
     direction: Direction,
-    /// Its level, for the MCU's status.
-    shown: Arc<Level>,
+    level: Arc<Level>,
+    /// Set while a feature drives it as an output.
+    output: Option<Output>,
 }
 
 impl Claim {
-    pub(super) fn state(&self) -> LineState {
+    fn state(&self) -> LineState {
         let bus = self.slow.as_ref().map(|(_, calls)| calls.counts());
         let fast = self.line.is_fast();
-        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), fast, bus }
+        LineState { pin: self.pin, use_: self.direction.into(), level: self.level.get(), fast, bus }
     }
 
-    pub(super) fn is_in_bank(&self) -> bool {
-        self.line.bank().is_some()
+    pub(super) fn pin(&self) -> Pin {
+        self.pin
     }
 
-    /// The line for a user that calls it directly, for example an errand.
+    pub(super) fn line(&self) -> Arc<dyn Line> {
+        self.line.clone()
+    }
+
+    pub(super) fn level(&self) -> Arc<Level> {
+        self.level.clone()
+    }
+
+    pub(super) fn output(&self) -> Option<&Output> {
+        self.output.as_ref()
+    }
+
+    /// The level of an output in a stopped MCU.
+    pub(super) fn shutdown_value(&self) -> Option<bool> {
+        if let Direction::Output { shutdown_value, .. } = self.direction { Some(shutdown_value) } else { None }
+    }
+
+    /// Drives the line from the core.
+    pub(super) fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.line.write(level)?;
+        self.level.set(level);
+        Ok(())
+    }
+
+    /// The line in the worker of its chip, if calls to that chip may be slow.
+    pub(super) fn slow(&self) -> Option<DeviceId<Repeated>> {
+        self.slow.as_ref().map(|(line, _)| *line)
+    }
+
+    /// The line for a user that calls it directly, for example a job.
     fn shared(&self) -> Arc<dyn Line> {
-        let watched = Arc::new(Watched { line: self.line.clone(), shown: self.shown.clone() });
+        let line = Arc::new(Watched { line: self.line.clone(), level: self.level.clone() });
         match &self.slow {
-            None => watched,
-            Some((_, calls)) => Arc::new(Repeated { line: watched, calls: calls.clone() }),
+            None => line,
+            Some((_, calls)) => Arc::new(Repeated { line, calls: calls.clone() }),
         }
     }
 }
 
-/// A line that records its level for the status when an errand drives or reads it. Errands measure the time between
-/// edges, so a write returns when it has reached the line.
-struct Watched {
-    line: Arc<dyn Line>,
-    shown: Arc<Level>,
+/// Records the edges of outputs. Core and workers call it.
+pub trait EdgeRecorder: Send + Sync {
+    /// A line is in use from now on.
+    fn claimed(&self, pin: Pin, name: String);
+
+    /// An output has changed its level.
+    fn edge(&self, pin: Pin, level: bool);
 }
 
-impl Line for Watched {
+/// The level of a line when it was last driven or read. The core or a worker writes this byte.
+#[derive(Debug)]
+pub(super) struct Level(AtomicU8);
+
+const UNKNOWN: u8 = 2;
+
+impl Level {
+    fn unknown() -> Level {
+        Level(AtomicU8::new(UNKNOWN))
+    }
+
+    /// Called when the line is set up.
+    fn begin(&self, direction: Direction) {
+        match direction {
+            Direction::Output { level, .. } => self.set(level),
+            _ => self.0.store(UNKNOWN, Ordering::Relaxed),
+        }
+    }
+
+    #[inline]
+    pub(super) fn set(&self, level: bool) {
+        self.0.store(u8::from(level), Ordering::Relaxed);
+    }
+
+    /// Whether it is known to be high.
+    #[inline]
+    pub(super) fn is_high(&self) -> bool {
+        self.0.load(Ordering::Relaxed) == 1
+    }
+
+    fn get(&self) -> Option<bool> {
+        match self.0.load(Ordering::Relaxed) {
+            UNKNOWN => None,
+            level => Some(level != 0),
+        }
+    }
+}
+
+/// A line whose edges are recorded. It compares with the level before its user stores the new one.
+struct Recorded {
+    line: Arc<dyn Line>,
+    pin: Pin,
+    level: Arc<Level>,
+    recorder: Arc<dyn EdgeRecorder>,
+}
+
+impl Recorded {
+    fn is_now(&self, level: bool) {
+        if self.level.get() != Some(level) {
+            self.recorder.edge(self.pin, level);
+        }
+    }
+
+    fn turned(&self, direction: Direction) {
+        match direction {
+            Direction::Output { level, .. } => self.is_now(level),
+            Direction::OpenDrain => self.is_now(true),
+            // Somebody else sets its level.
+            Direction::Input(_) => {}
+        }
+    }
+}
+
+/// It is in no bank, so that each edge is recorded when it is made.
+impl Line for Recorded {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
-        self.shown.set(level);
         self.line.write(level)?;
-        self.line.flush();
+        self.is_now(level);
         Ok(())
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
-        self.line.read().inspect(|level| self.shown.set(*level))
+        self.line.read()
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.shown.begin(direction);
-        self.line.set_direction(direction)
+        self.line.set_direction(direction)?;
+        self.turned(direction);
+        Ok(())
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.shown.begin(direction);
-        self.line.turn(direction)
+        self.line.turn(direction)?;
+        self.turned(direction);
+        Ok(())
+    }
+
+    fn is_fast(&self) -> bool {
+        self.line.is_fast()
+    }
+
+    fn flush(&self) {
+        self.line.flush();
+    }
+
+    fn is_posted(&self) -> bool {
+        self.line.is_posted()
+    }
+}
+
+/// A line that records its level for the status when a job drives or reads it. Jobs measure the time between
+/// edges, so a write returns when it has reached the line.
+struct Watched {
+    line: Arc<dyn Line>,
+    level: Arc<Level>,
+}
+
+impl Line for Watched {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.line.write(level)?;
+        self.line.flush();
+        self.level.set(level);
+        Ok(())
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        self.line.read().inspect(|level| self.level.set(*level))
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.line.set_direction(direction)?;
+        self.level.begin(direction);
+        Ok(())
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.line.turn(direction)?;
+        self.level.begin(direction);
+        Ok(())
     }
 
     fn is_fast(&self) -> bool {
@@ -98,7 +269,7 @@ impl Line for Watched {
 
 /// A line of a chip that may sleep. Each call may be repeated.
 #[derive(Clone)]
-struct Repeated {
+pub(super) struct Repeated {
     line: Arc<dyn Line>,
     calls: Calls,
 }
@@ -121,67 +292,6 @@ impl Line for Repeated {
     }
 }
 
-/// An output that the core itself drives. A call takes one or two microseconds.
-pub struct PromptLine {
-    line: Arc<dyn Line>,
-    level: bool,
-    shown: Arc<Level>,
-    /// A batch has made an edge that its user has not seen yet.
-    is_batched: bool,
-}
-
-impl PromptLine {
-    /// Drives the line.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed".
-    #[inline]
-    pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
-        self.level = level;
-        self.shown.set(level);
-        self.line.write(level)
-    }
-
-    /// Inverts the line.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed".
-    #[inline]
-    pub fn toggle(&mut self) -> Result<(), Shutdown> {
-        self.write(!self.level)
-    }
-
-    /// Returns when the last write has reached the line ([`Line::flush`]).
-    #[inline]
-    pub fn flush(&self) {
-        self.line.flush();
-    }
-
-    /// Whether the line is written without a call of the kernel.
-    pub fn is_fast(&self) -> bool {
-        self.line.is_fast()
-    }
-
-    /// Inverts the line with a batch of edges, if the batch takes it.
-    pub fn join(&mut self, batch: &mut Batch) -> bool {
-        let level = !self.level;
-        self.is_batched = self.line.bank().is_some_and(|(bank, line)| batch.add(bank, line, level));
-        if self.is_batched {
-            self.level = level;
-            self.shown.set(level);
-        }
-        self.is_batched
-    }
-
-    /// Whether a batch has inverted the line since the last call.
-    #[inline]
-    pub fn was_batched(&mut self) -> bool {
-        mem::take(&mut self.is_batched)
-    }
-}
-
 impl Settable for Repeated {
     type Value = bool;
 
@@ -190,200 +300,70 @@ impl Settable for Repeated {
     }
 }
 
-/// An output line of any chip.
-pub struct OutputLine {
-    level: bool,
-    driver: Driver,
-    shown: Arc<Level>,
-}
-
-enum Driver {
-    Prompt(Arc<dyn Line>),
-    Slow(Remote<Repeated>),
-}
-
-impl OutputLine {
-    /// Drives the line, directly or through its chip's worker.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed".
-    #[inline]
-    pub fn write(&mut self, turn: &mut Turn, level: bool) -> Result<(), Shutdown> {
-        self.level = level;
-        self.shown.set(level);
-        match &mut self.driver {
-            Driver::Prompt(line) => line.write(level),
-            Driver::Slow(line) => line.set(turn, level),
-        }
-    }
-
-    /// Inverts the line.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed".
-    #[inline]
-    pub fn toggle(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        self.write(turn, !self.level)
-    }
-
-    /// Drives the line of a stopped MCU to `level`, its shutdown value.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed".
-    pub fn make_safe(&mut self, turn: &mut Turn, level: bool) -> Result<Safe, Shutdown> {
-        self.write(turn, level)?;
-        Ok(match self.driver {
-            Driver::Prompt(_) => Safe::Now,
-            Driver::Slow(_) => Safe::Later,
-        })
-    }
-
-    /// Handles the worker's finished write, if it was to this line ([`Remote::settle`]).
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line write failed", unless the MCU is stopped.
-    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
-        match &mut self.driver {
-            Driver::Prompt(_) => Ok(()),
-            Driver::Slow(line) => line.settle(turn, kind, done),
-        }
-    }
-}
-
-/// Reads an input of a chip that may sleep.
-struct Sampling(Repeated);
-
-impl Errand for Sampling {
-    type Answer = bool;
-    type Failure = Shutdown;
-
-    fn run(&mut self) -> Result<bool, Shutdown> {
-        self.0.read()
-    }
-}
-
-/// The result of a worker's look at an input.
-pub struct Look {
-    /// `None` if the look failed.
-    pub level: Option<bool>,
-    /// When the worker began to look.
-    pub began: Clock,
-    /// When the worker finished.
-    pub ended: Clock,
-}
-
-/// An input line of any chip.
-pub struct InputLine {
-    pin: Pin,
-    sensor: Sensor,
-    shown: Arc<Level>,
-}
-
-enum Sensor {
-    Prompt(Arc<dyn Line>),
-    Slow { worker: WorkerId, look: Slot<Sampling>, unread: Unread },
-}
-
-impl InputLine {
-    fn new(claim: &Claim) -> InputLine {
-        let (line, shown) = (claim.line.clone(), claim.shown.clone());
-        let sensor = match &claim.slow {
-            None => Sensor::Prompt(line),
-            Some((worker, calls)) => {
-                let look = Slot::new(Sampling(Repeated { line, calls: calls.clone() }));
-                Sensor::Slow { worker: *worker, look, unread: Unread::default() }
-            }
-        };
-        InputLine { pin: claim.pin, sensor, shown }
-    }
-
-    /// The line's level. `None` if the chip's worker has to look: the level then comes later, to the object's
-    /// `returned`.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line read failed".
-    #[inline]
-    pub fn read(&mut self, turn: &mut Turn) -> Result<Option<bool>, Shutdown> {
-        if let Sensor::Slow { worker, look, unread } = &mut self.sensor
-            && look.is_here()
-        {
-            unread.asked(turn.now());
-            look.send(turn, *worker)?;
-        }
-        self.prompt_level()
-    }
-
-    /// The line's level; `None` if the chip's worker would have to look.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line read failed".
-    #[inline]
-    pub fn prompt_level(&self) -> Result<Option<bool>, Shutdown> {
-        match &self.sensor {
-            Sensor::Prompt(line) => line.read().inspect(|level| self.shown.set(*level)).map(Some),
-            Sensor::Slow { .. } => Ok(None),
-        }
-    }
-
-    /// Whether the chip's worker is looking at the line.
-    pub fn is_looking(&self) -> bool {
-        matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
-    }
-
-    /// Handles a finished look, if it was at this line. It fails with "GPIO line read failed" when no look has
-    /// succeeded for [`UNREAD_LIMIT`].
-    pub fn sampled(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(turn, done, false)
-    }
-
-    /// The same, if a move depends on the input. One failed look is a failure at once.
-    pub fn seen(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
-        self.take_in(turn, done, true)
-    }
-
-    fn take_in(&mut self, turn: &Turn, done: &mut Done, at_once: bool) -> Option<Result<Look, Shutdown>> {
-        let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
-        let Back { result, began, ended, .. } = look.back(done)?;
-        let level = match result {
-            Ok(level) => {
-                unread.read();
-                self.shown.set(level);
-                Ok(Some(level))
-            }
-            Err(failure) if at_once || unread.is_too_long(ended) => turn.try_shut_down(failure.clone()).map(|()| None),
-            Err(_) => Ok(None),
-        };
-        Some(level.map(|level| Look { level, began, ended }))
-    }
-
-    /// Checks a look that may still be on its way. Call this while one may be.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line read failed" when no look has succeeded for [`UNREAD_LIMIT`].
-    pub fn awaited(&self, turn: &mut Turn) -> Result<(), Shutdown> {
-        let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
-        if look.is_here() || !unread.is_too_long(turn.now()) {
-            return Ok(());
-        }
-        let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.as_ms());
-        let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
-        turn.try_shut_down(
-            stop.remedy("check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART"),
-        )
-    }
-}
-
 /// The counter of a line's edges and the worker that reads it, or the reason why there is none.
-pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
+pub type CountedEdges = Result<DeviceId<dyn Edges>, Box<str>>;
 
-impl Mcu {
+impl State {
+    /// Claims a line for one more use, and returns its place. `output`: a feature drives it.
+    fn claim(&mut self, pin: Pin, direction: Direction, output: Option<Output>) -> Result<usize, Shutdown> {
+        let pin = self.board.canonical(pin);
+        let Some(place) = self.lines.find(pin) else {
+            let ClaimedLine { line, sleeps_on } = self.board.line(pin, direction)?;
+            let level = Arc::new(Level::unknown());
+            let line = match &self.recorder {
+                None => line,
+                Some(recorder) => {
+                    recorder.claimed(pin, pin.name_in(&self.board.pins()));
+                    let recorded = Recorded { line, pin, level: level.clone(), recorder: recorder.clone() };
+                    recorded.turned(direction);
+                    Arc::new(recorded)
+                }
+            };
+            return self.enter(pin, ClaimedLine { line, sleeps_on }, direction, level, output);
+        };
+        let claim = &mut self.lines.claims[place];
+        let is_driven = |output: Option<&Output>| output.is_some_and(Output::is_driven_at_stop);
+        // An output of an object keeps its shutdown value when something else drives the same line.
+        let kept = claim.shutdown_value().filter(|_| is_driven(claim.output.as_ref()) && !is_driven(output.as_ref()));
+        let direction = match (direction, kept) {
+            (Direction::Output { level, .. }, Some(shutdown_value)) => Direction::Output { level, shutdown_value },
+            (direction, _) => direction,
+        };
+        claim.line.set_direction(direction)?;
+        claim.direction = direction;
+        claim.level.begin(direction);
+        if kept.is_none() || claim.shutdown_value().is_none() {
+            claim.output = output.map(|output| output.taking_over(claim.output.take()));
+        }
+        Ok(place)
+    }
+
+    /// Adds a line from the board to the table.
+    fn enter(
+        &mut self,
+        pin: Pin,
+        claimed: ClaimedLine,
+        direction: Direction,
+        level: Arc<Level>,
+        output: Option<Output>,
+    ) -> Result<usize, Shutdown> {
+        let ClaimedLine { line, sleeps_on } = claimed;
+        let slow = match sleeps_on {
+            None => None,
+            Some(chip) => {
+                let calls = Calls::new(self.scheduler.clock());
+                let watched = Arc::new(Watched { line: line.clone(), level: level.clone() });
+                let line = Box::new(Repeated { line: watched, calls: calls.clone() });
+                Some((self.device(&chip, line)?, calls))
+            }
+        };
+        level.begin(direction);
+        self.lines.claims.push(Claim { pin, line, slow, direction, level, output });
+        Ok(self.lines.claims.len() - 1)
+    }
+}
+
+impl Context<'_> {
     /// The board, to claim a resource. A claim opens files and waits for the guardian. It would delay the steps of a
     /// configured MCU.
     ///
@@ -394,95 +374,77 @@ impl Mcu {
         if self.is_finalized() {
             return Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, "a pin or bus is claimed after finalize_config"));
         }
-        Ok(&mut *self.board)
+        Ok(&mut *self.state.board)
     }
 
     /// Claims a line for one more use. It fails after `finalize_config`.
     fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         self.board()?;
-        self.claim_at_any_time(pin, direction)
+        let place = self.state.claim(pin, direction, None)?;
+        Ok(&self.state.lines.claims[place])
     }
 
-    fn claim_at_any_time(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
-        let pin = self.board.canonical(pin);
-        if let Some(place) = self.configuration.claims.iter().position(|claim| claim.pin == pin) {
-            let claim = &mut self.configuration.claims[place];
-            claim.line.set_direction(direction)?;
-            claim.direction = direction;
-            claim.shown.begin(direction);
-            return Ok(claim);
+    fn claim_output(&mut self, pin: Pin, direction: Direction, is_kept: bool) -> Result<usize, Shutdown> {
+        self.board()?;
+        let output = Output::of(self.oid(), is_kept);
+        let place = self.state.claim(pin, direction, Some(output))?;
+        let claim = &mut self.state.lines.claims[place];
+        let slow = claim.slow();
+        if let (Some(output), Some(line)) = (&mut claim.output, slow) {
+            output.give_writer(place, line, claim.level.is_high());
         }
-        let claimed = self.board.line(pin, direction)?;
-        self.enter(pin, claimed, direction)
+        Ok(place)
     }
 
-    /// Adds a line from the board to the table.
-    fn enter(&mut self, pin: Pin, claimed: ClaimedLine, direction: Direction) -> Result<&Claim, Shutdown> {
-        let ClaimedLine { line, sleeps_on } = claimed;
-        let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
-        let slow = worker.map(|worker| (worker, Calls::new(self.clock())));
-        let shown = Arc::new(Level::of(direction));
-        let place = self.configuration.claims.len();
-        self.configuration.claims.push(Claim { pin, line, slow, direction, shown });
-        Ok(&self.configuration.claims[place])
-    }
-
-    /// Claims an output and drives it to `level`. It goes to `shutdown_value` when the MCU stops.
+    /// Claims an output and drives it to `level`. The MCU drives it to `shutdown_value` when it stops.
     ///
     /// # Errors
     ///
     /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn output(&mut self, pin: Pin, level: bool, shutdown_value: bool) -> Result<OutputLine, Shutdown> {
-        let claim = self.claim(pin, Direction::Output { level, shutdown_value })?;
-        let (line, shown) = (claim.line.clone(), claim.shown.clone());
-        let driver = match &claim.slow {
-            None => Driver::Prompt(line),
-            Some((worker, calls)) => Driver::Slow(Remote::new(*worker, Repeated { line, calls: calls.clone() }, level)),
-        };
-        Ok(OutputLine { level, driver, shown })
+        let place = self.claim_output(pin, Direction::Output { level, shutdown_value }, false)?;
+        Ok(OutputLine::new(place, &self.state.lines.claims[place]))
     }
 
-    /// Claims an output with exact edges, for example `step`. It refuses a chip that may sleep.
+    /// Claims an output that keeps its level when the MCU stops. `level` is also its level if the program dies.
+    ///
+    /// # Errors
+    ///
+    /// The board's errors, for example "Unable to open out GPIO chip line".
+    pub fn kept_output(&mut self, pin: Pin, level: bool) -> Result<OutputLine, Shutdown> {
+        let place = self.claim_output(pin, Direction::Output { level, shutdown_value: level }, true)?;
+        Ok(OutputLine::new(place, &self.state.lines.claims[place]))
+    }
+
+    /// Claims an output with exact edges, for example `step`. It refuses a chip that may sleep. `idle` is its level now
+    /// and if the program dies. `is_kept`: a stop of the MCU leaves its level.
     ///
     /// # Errors
     ///
     /// The board's errors, and "Unable to open out GPIO chip line" for a chip that may sleep.
-    pub fn prompt_output(
-        &mut self,
-        pin: Pin,
-        use_: &str,
-        level: bool,
-        shutdown_value: bool,
-    ) -> Result<PromptLine, Shutdown> {
-        let claim = self.prompt_claim(pin, use_, Direction::Output { level, shutdown_value })?;
-        Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone(), is_batched: false })
+    pub fn prompt_output(&mut self, pin: Pin, use_: &str, idle: bool, is_kept: bool) -> Result<PromptLine, Shutdown> {
+        let direction = Direction::Output { level: idle, shutdown_value: idle };
+        let place = self.claim_output(pin, direction, is_kept)?;
+        let claim = &mut self.state.lines.claims[place];
+        if claim.slow.is_some() {
+            claim.output = None;
+            return Err(too_slow(&self.name(pin), use_, direction));
+        }
+        Ok(PromptLine::new(claim))
     }
 
-    /// Claims a line with exact edges, for an errand that drives or reads it. It refuses a chip that may sleep.
+    /// Claims a line with exact edges, for a job that drives or reads it. It refuses a chip that may sleep.
     ///
     /// # Errors
     ///
     /// The board's errors. For a chip that may sleep it is "Unable to open out GPIO chip line", or for an input "Unable
     /// to open in GPIO chip line".
     pub fn prompt_line(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<Arc<dyn Line>, Shutdown> {
-        self.prompt_claim(pin, use_, direction).map(Claim::shared)
-    }
-
-    fn prompt_claim(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<&Claim, Shutdown> {
-        if self.claim(pin, direction)?.slow.is_some() {
-            let name = self.name(pin);
-            let refused = match direction {
-                Direction::Input(_) => reason::INPUT_LINE,
-                _ => reason::OUTPUT_LINE,
-            };
-            let cause = format!(
-                "{name} cannot be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds"
-            );
-            return Err(Shutdown::because(refused, cause).remedy("choose a pin of the processor itself"));
+        let claim = self.claim(pin, direction)?;
+        if claim.slow.is_some() {
+            return Err(too_slow(&self.name(pin), use_, direction));
         }
-        let own = self.board.canonical(pin);
-        let claimed = self.configuration.claims.iter().find(|claim| claim.pin == own);
-        claimed.ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
+        Ok(claim.shared())
     }
 
     /// Claims an output that workers drive, for example a chip select. `level` is also its shutdown value.
@@ -519,7 +481,7 @@ impl Mcu {
     ///
     /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        self.claim(pin, Direction::Input(bias)).map(InputLine::new)
+        self.claim(pin, Direction::Input(bias)).map(|claim| InputLine::new(0, claim))
     }
 
     /// Claims an input, with edges counted by an interrupt if possible.
@@ -529,13 +491,15 @@ impl Mcu {
     /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
         let own = self.board()?.canonical(pin);
-        if self.configuration.claims.iter().any(|claim| claim.pin == own) {
+        if self.state.lines.find(own).is_some() {
             return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
         }
-        let CountedLine { line, edges } = self.board.counted_line(own, bias)?;
-        let input = InputLine::new(self.enter(own, line, Direction::Input(bias))?);
+        let CountedLine { line, edges } = self.state.board.counted_line(own, bias)?;
+        let level = Arc::new(Level::unknown());
+        let place = self.state.enter(own, line, Direction::Input(bias), level, None)?;
+        let input = InputLine::new(0, &self.state.lines.claims[place]);
         let edges = match edges {
-            Ok(OnWorker { bus, device }) => Ok((self.workers.start(&bus)?, device)),
+            Ok(OnWorker { bus, device }) => Ok(self.device(&bus, device)?),
             Err(why) => Err(why),
         };
         Ok((input, edges))
@@ -547,12 +511,22 @@ impl Mcu {
     /// # Errors
     ///
     /// The board's errors, for example "Unable to open in GPIO chip line".
-    pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        self.claim_at_any_time(pin, Direction::Input(bias)).map(InputLine::new)
+    pub fn late_input(&mut self, number: u8, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
+        let place = self.state.claim(pin, Direction::Input(bias), None)?;
+        Ok(InputLine::new(number, &self.state.lines.claims[place]))
     }
 
     /// The pin's name in the dictionary.
     pub fn name(&self, pin: Pin) -> String {
-        pin.name_in(&self.board.pins())
+        pin.name_in(&self.state.board.pins())
     }
+}
+
+#[cold]
+fn too_slow(name: &str, use_: &str, direction: Direction) -> Shutdown {
+    let refused = if let Direction::Input(_) = direction { reason::INPUT_LINE } else { reason::OUTPUT_LINE };
+    let cause = format!(
+        "{name} cannot be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds"
+    );
+    Shutdown::because(refused, cause).remedy("choose a pin of the processor itself")
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The messages between host and MCU: commands, responses, and their dialect.
+//! The messages between host and MCU: commands, responses, and their dialect; notes for the log.
 
 #![forbid(unsafe_code)]
 
@@ -9,13 +9,74 @@ use crate::shutdown::{Shutdown, reason};
 use pinion_protocol::vlq::{Reader, Writer};
 
 use super::dialect::READ_ANEW;
-use super::{Dialect, Generations, Mcu, Response, base};
+use super::{Dialect, Generations, Mcu, Note, Outbox, Response, State, base};
 
-/// The dialects of the host that configured the MCU, and of a later host.
-pub(super) struct Spoken {
-    pub(super) dialect: Arc<Dialect>,
+/// The way to the host and to the log.
+pub(super) struct HostWire {
+    /// The dialect of the host that configured the MCU.
+    dialect: Arc<Dialect>,
     /// The dialect of a host that came after the MCU was configured.
-    pub(super) next: Option<Arc<Dialect>>,
+    next: Option<Arc<Dialect>>,
+    outbox: Box<dyn Outbox>,
+}
+
+impl HostWire {
+    pub(super) fn new(dialect: Arc<Dialect>, outbox: Box<dyn Outbox>) -> HostWire {
+        HostWire { dialect, next: None, outbox }
+    }
+
+    /// The dialect that the MCU speaks.
+    pub(super) fn dialect(&self) -> &Arc<Dialect> {
+        &self.dialect
+    }
+
+    /// The dialect of the present host.
+    #[inline]
+    pub(super) fn heard(&self) -> &Arc<Dialect> {
+        self.next.as_ref().unwrap_or(&self.dialect)
+    }
+
+    /// Whether the present host is not the one that configured the MCU.
+    #[inline]
+    pub(super) fn is_foreign(&self) -> bool {
+        self.next.is_some()
+    }
+
+    /// Speaks the dialect of the present host from now on.
+    pub(super) fn take_next(&mut self) {
+        if let Some(dialect) = self.next.take() {
+            self.dialect = dialect;
+        }
+    }
+
+    /// Whether the host uses responses of type `R`.
+    pub(super) fn speaks<R: Response>(&self) -> bool {
+        self.dialect.response_id::<R>().is_some()
+    }
+
+    /// Whether the MCU behaves as hosts of these generations expect.
+    pub(super) fn serves(&self, hosts: Generations) -> bool {
+        self.dialect.serves(hosts)
+    }
+
+    /// Sends a response, if the host uses it.
+    pub(super) fn send<R: Response>(&mut self, response: R) {
+        if self.is_foreign() && !base::is_own_response(R::INDEX) {
+            return;
+        }
+        let Some(id) = self.dialect.response_id::<R>() else { return };
+        let mut writer = Writer::default();
+        writer.int(id);
+        response.encode(&mut writer);
+        if let Some(payload) = writer.payload() {
+            self.outbox.send(payload);
+        }
+    }
+
+    /// Leaves a note for the log.
+    pub(super) fn note(&mut self, note: Note<'_>) {
+        self.outbox.note(note);
+    }
 }
 
 impl Mcu {
@@ -24,10 +85,10 @@ impl Mcu {
     #[inline]
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
         let command = *payload;
-        self.schedule.is_behind = false;
-        self.holds.is_commanded = true;
+        self.state.scheduler.begin_command();
+        self.state.barrier.begin_command();
         let done = self.try_execute(payload);
-        self.holds.is_commanded = false;
+        self.state.barrier.end_command();
         if let Err(mut shutdown) = done {
             if shutdown.reason == reason::COMMAND_PARSER {
                 shutdown = self.cut_short(command);
@@ -44,7 +105,7 @@ impl Mcu {
 
     /// The dialect of the present host. The MCU may not be able to serve it yet.
     pub fn heard(&self) -> &Arc<Dialect> {
-        self.spoken.next.as_ref().unwrap_or(&self.spoken.dialect)
+        self.state.wire.heard()
     }
 
     /// The error for a command that ends before its parameters do.
@@ -60,17 +121,17 @@ impl Mcu {
     fn try_execute(&mut self, payload: &mut Reader<'_>) -> Result<(), Shutdown> {
         let id = payload.int()?;
         let command = self.heard().command(id)?;
-        let is_foreign = self.spoken.next.is_some() && !command.is_own;
-        match self.stop.reason {
+        let is_foreign = self.state.wire.is_foreign() && !command.is_own;
+        match self.state.phase.stop_reason() {
             // Without this, some commands of another dialect would run here, on objects of another host.
             Some(reason) if is_foreign || !command.in_shutdown => {
                 command.skip(payload)?;
-                let static_string_id = self.spoken.dialect.static_string_id(reason);
-                self.send(base::IsShutdown { static_string_id });
+                let static_string_id = self.state.wire.dialect.static_string_id(reason);
+                self.state.wire.send(base::IsShutdown { static_string_id });
                 Ok(())
             }
             None if is_foreign => {
-                let (spoken, heard) = (self.spoken.dialect.name(), self.heard().name());
+                let (spoken, heard) = (self.dialect().name(), self.heard().name());
                 let cause = format!(
                     "the MCU is configured by a host of the dialect {spoken}, and the present one speaks {heard}"
                 );
@@ -90,40 +151,16 @@ impl Mcu {
     /// If only the board has changed, the dialect is the same and only the names of pins differ. Then the change is
     /// made at once.
     pub fn speak(&mut self, dialect: Arc<Dialect>) {
-        self.spoken.next = None;
-        if dialect.name() == self.spoken.dialect.name() || !self.is_allocated() && !self.is_finalized() {
-            self.spoken.dialect = dialect;
-        } else {
-            self.spoken.next = Some(dialect);
+        let State { wire, phase, .. } = &mut self.state;
+        let is_free = dialect.name() == wire.dialect.name() || !phase.is_allocated();
+        wire.next = Some(dialect);
+        if is_free {
+            wire.take_next();
         }
     }
 
     /// The dialect that the MCU speaks.
     pub fn dialect(&self) -> &Arc<Dialect> {
-        &self.spoken.dialect
-    }
-
-    /// Whether the host uses responses of type `R`.
-    pub fn speaks<R: Response>(&self) -> bool {
-        self.spoken.dialect.response_id::<R>().is_some()
-    }
-
-    /// Whether the MCU behaves as hosts of these generations expect, where no form of a message tells them apart.
-    pub fn serves(&self, hosts: Generations) -> bool {
-        self.spoken.dialect.serves(hosts)
-    }
-
-    /// Sends a response, if the host uses it.
-    pub fn send<R: Response>(&mut self, response: R) {
-        if self.spoken.next.is_some() && !base::is_own_response(R::INDEX) {
-            return;
-        }
-        let Some(id) = self.spoken.dialect.response_id::<R>() else { return };
-        let mut writer = Writer::default();
-        writer.int(id);
-        response.encode(&mut writer);
-        if let Some(payload) = writer.payload() {
-            self.outbox.send(payload);
-        }
+        &self.state.wire.dialect
     }
 }

@@ -11,60 +11,67 @@ use std::sync::Arc;
 use crate::board::Board;
 use crate::time::Timing;
 
+mod barrier;
 pub mod base;
 mod batch;
 mod bus;
 mod calls;
 mod command;
 mod configuration;
+mod context;
 mod dialect;
-mod errand;
 mod generation;
-mod hold;
+mod inputs;
+mod job;
+mod job_slot;
 mod lines;
 mod messages;
 mod moves;
-mod object;
+mod objects;
 mod outbox;
+mod outputs;
 mod parameters;
+mod phase;
 mod remote;
-mod schedule;
-mod slot;
+mod scheduler;
 mod snapshot;
 mod stats;
 mod stop;
 mod timers;
-mod turn;
 mod wire;
 
 pub use crate::{command, response};
+pub use barrier::Hold;
 pub use batch::Batch;
-pub use bus::{Bus, Conversation, Talk};
+pub use bus::{Bus, Chip};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
+pub use context::Context;
 pub use dialect::{Dialect, Firmware};
-pub use errand::{Completion, Done, Errand, Job, Parcel, Refused, WorkerId, Workers};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
-pub use hold::Hold;
-pub use lines::{InputLine, Look, OutputLine, PromptLine};
+pub use inputs::{InputLine, Look};
+pub use job::{AnyJob, DeviceId, Devices, Finished, Job, SentJob, WorkerId, Workers};
+pub use job_slot::{Back, JobSlot};
+pub use lines::EdgeRecorder;
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
-pub use object::{Next, Object, Safe};
-pub use outbox::{Note, Outbox};
+pub use objects::{Next, Object, Safe};
+pub use outbox::{DeviceWarning, Note, Outbox};
+pub use outputs::{OutputLine, PromptLine};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
-pub use schedule::{Latest, SPIN_MAX};
-pub use slot::{Back, Slot};
+pub use scheduler::{Latest, SPIN_MAX};
 pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;
 pub use timers::Timer;
-pub use turn::Turn;
 pub use wire::{CANBUS_UUID_BYTES, CanHealth, CanNode, CanState, Wire};
 
-use configuration::{Configuration, OBJECTS_MAX};
-use hold::Holds;
-use messages::Spoken;
-use schedule::Schedule;
-use stop::Stop;
+use barrier::Barrier;
+use lines::Lines;
+use messages::HostWire;
+use objects::{OBJECTS_MAX, Objects};
+use phase::Phase;
+use scheduler::Scheduler;
+use stop::PendingValues;
 use timers::TimerId;
 
 /// The MCU's own responses come first in the list of all responses.
@@ -72,18 +79,25 @@ const fn response_index(format: &str) -> usize {
     place_of_response(&[base::FEATURE], format)
 }
 
-/// The MCU.
+/// The MCU, for the program that runs it: it runs timers, commands and finished jobs.
 pub struct Mcu {
-    /// Counts the free moves.
-    pub moves: MovePool,
-    schedule: Schedule,
+    state: State,
+}
+
+/// The state of the MCU. A feature sees it through its [`Context`]: it cannot run timers or commands.
+struct State {
+    phase: Phase,
+    scheduler: Scheduler,
+    objects: Objects,
+    lines: Lines,
+    barrier: Barrier,
+    pending: PendingValues,
+    moves: MovePool,
+    wire: HostWire,
     board: Box<dyn Board>,
     workers: Box<dyn Workers>,
-    outbox: Box<dyn Outbox>,
-    spoken: Spoken,
-    configuration: Configuration,
-    holds: Holds,
-    stop: Stop,
+    /// Set if somebody records the edges of outputs.
+    recorder: Option<Arc<dyn EdgeRecorder>>,
 }
 
 impl Mcu {
@@ -95,18 +109,30 @@ impl Mcu {
         workers: Box<dyn Workers>,
         outbox: Box<dyn Outbox>,
     ) -> Mcu {
-        let mut mcu = Mcu {
+        let mut state = State {
+            phase: Phase::default(),
+            scheduler: Scheduler::new(timing),
+            objects: Objects::default(),
+            lines: Lines::default(),
+            barrier: Barrier::default(),
+            pending: PendingValues::default(),
             moves: MovePool::default(),
-            schedule: Schedule::new(timing),
+            wire: HostWire::new(dialect, outbox),
             board,
             workers,
-            outbox,
-            spoken: Spoken { dialect, next: None },
-            configuration: Configuration::default(),
-            holds: Holds::default(),
-            stop: Stop::default(),
+            recorder: None,
         };
-        mcu.send(base::Starting {});
-        mcu
+        state.wire.send(base::Starting {});
+        Mcu { state }
+    }
+
+    /// Records the edges of the outputs that a host claims from now on.
+    pub fn record_edges(&mut self, recorder: Arc<dyn EdgeRecorder>) {
+        self.state.recorder = Some(recorder);
+    }
+
+    /// The context of a command to the MCU itself. A handler that [`command!`] makes passes it on.
+    pub fn context(&mut self) -> Context<'_> {
+        Context::new(&mut self.state, Oid::NONE)
     }
 }

@@ -14,13 +14,18 @@ pub const MOVE_COUNT: u16 = 1024;
 #[derive(Debug, Default)]
 pub struct MovePool {
     free: u16,
-    pub(super) count: u16,
+    count: u16,
 }
 
 impl MovePool {
     pub(super) fn finalize(&mut self) {
         self.count = MOVE_COUNT;
         self.free = MOVE_COUNT;
+    }
+
+    /// How many moves there are.
+    pub(super) fn count(&self) -> u16 {
+        self.count
     }
 
     /// How many moves are queued, and how many there are in all.

@@ -6,6 +6,7 @@
 use crate::lateness::Lateness;
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
+use crate::trouble::Trouble;
 
 /// Where the MCU leaves responses for the host and notes for the log. Its methods run in the core. They must not
 /// allocate or block.
@@ -18,6 +19,22 @@ pub trait Outbox: Send {
     fn note(&mut self, note: Note<'_>);
 }
 
+/// A warning about a device, for the log.
+#[derive(Debug)]
+pub struct DeviceWarning {
+    /// The first words of the warning. The log limits the lines that begin with them.
+    pub kind: &'static str,
+    /// The warning.
+    pub trouble: Trouble,
+}
+
+impl DeviceWarning {
+    /// A warning that begins with `kind`.
+    pub fn new(kind: &'static str, trouble: impl Into<Trouble>) -> DeviceWarning {
+        DeviceWarning { kind, trouble: trouble.into() }
+    }
+}
+
 /// An event that belongs in the log.
 #[derive(Debug)]
 pub enum Note<'a> {
@@ -25,6 +42,8 @@ pub enum Note<'a> {
     Shutdown(&'a Shutdown),
     /// A failure that does not stop the MCU.
     Warning(&'a Shutdown),
+    /// A warning that no object is named in.
+    Device(&'a DeviceWarning),
     /// Another failure while the MCU stops or is stopped.
     Trouble(&'a Shutdown),
     /// This output is at its shutdown value after failed attempts.

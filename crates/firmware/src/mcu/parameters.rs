@@ -12,15 +12,18 @@ use pinion_protocol::format::{Arg, Field};
 use pinion_protocol::vlq::{Reader, Writer};
 
 #[cfg(doc)]
-use super::Mcu;
+use super::Context;
 
-/// An object's id. It is the host's oid, or the id of a feature's own object ([`Mcu::own`]).
+/// An object's id. It is the host's oid, or the id of a feature's own object ([`Context::own`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oid(u16);
 
 impl Oid {
     /// Lower ids are the host's. Ids from here on belong to features' own objects.
     pub(super) const FIRST_OWN: usize = 256;
+
+    /// No object: a command to the MCU runs.
+    pub(super) const NONE: Oid = Oid(u16::MAX);
 
     /// The id with this number on the wire.
     pub const fn new(oid: u8) -> Oid {
@@ -75,7 +78,7 @@ impl Arg<'_> for Ticks {
     }
 }
 
-/// A time as the host sends it: the low 32 bits of a clock. [`Mcu::instant`] completes it.
+/// A time as the host sends it: the low 32 bits of a clock. [`Context::instant`] completes it.
 #[derive(Clone, Copy, Debug)]
 pub struct WireClock(pub u32);
 

@@ -5,12 +5,12 @@
 
 use crate::shutdown::Shutdown;
 
-use super::{Back, Done, Errand, Hold, Slot, Turn, WorkerId};
+use super::{Back, Context, DeviceId, Finished, Hold, Job, JobSlot};
 
 /// An output that can be set to a value.
 pub trait Settable: Send + 'static {
     /// The type of its values.
-    type Value: Copy + Send;
+    type Value: Copy + Send + 'static;
 
     /// Sets the output. Runs on a worker, and may block there.
     ///
@@ -21,33 +21,36 @@ pub trait Settable: Send + 'static {
 }
 
 /// One write.
-struct Write<S: Settable> {
-    output: S,
-    value: S::Value,
-}
+struct Write<S: Settable>(S::Value);
 
-impl<S: Settable> Errand for Write<S> {
-    type Answer = ();
+impl<S: Settable> Job for Write<S> {
+    type Device = S;
+    type Out = ();
     type Failure = Shutdown;
 
-    fn run(&mut self) -> Result<(), Shutdown> {
-        self.output.set(self.value)
+    fn run(&mut self, output: &mut S) -> Result<(), Shutdown> {
+        output.set(self.0)
     }
 }
 
 /// An output that a worker sets. If several values come during a write, only the newest is written next. The others are
 /// out of date by then.
 pub struct Remote<S: Settable> {
-    worker: WorkerId,
-    write: Slot<Write<S>>,
+    output: DeviceId<S>,
+    write: JobSlot<Write<S>>,
     /// The value to write after the present write, and its hold on commands.
     next: Option<(S::Value, Hold)>,
 }
 
 impl<S: Settable> Remote<S> {
-    /// Creates an output of this worker that is at `value` now.
-    pub fn new(worker: WorkerId, output: S, value: S::Value) -> Remote<S> {
-        Remote { worker, write: Slot::new(Write { output, value }), next: None }
+    /// Creates an output that is at `value` now. Its object gets the writes back under `number`.
+    pub fn new(number: u8, output: DeviceId<S>, value: S::Value) -> Remote<S> {
+        Remote { output, write: JobSlot::numbered(number, Write(value)), next: None }
+    }
+
+    /// The same for the output at this place of the table of lines.
+    pub(super) fn of_output(place: usize, output: DeviceId<S>, value: S::Value) -> Remote<S> {
+        Remote { output, write: JobSlot::of_output(place, Write(value)), next: None }
     }
 
     /// Lets the worker set the output to `value`, now or after the present write. If a command calls this, the next
@@ -56,19 +59,19 @@ impl<S: Settable> Remote<S> {
     /// # Errors
     ///
     /// "Bus worker queue overflow".
-    pub fn set(&mut self, turn: &mut Turn, value: S::Value) -> Result<(), Shutdown> {
+    pub fn set(&mut self, context: &mut Context, value: S::Value) -> Result<(), Shutdown> {
         let hold = match self.next.take() {
             Some((_, hold @ Hold(true))) => hold,
-            _ => turn.hold(),
+            _ => context.hold(),
         };
-        self.write(turn, value, hold)
+        self.write(context, value, hold)
     }
 
-    fn write(&mut self, turn: &mut Turn, value: S::Value, hold: Hold) -> Result<(), Shutdown> {
+    fn write(&mut self, context: &mut Context, value: S::Value, hold: Hold) -> Result<(), Shutdown> {
         match self.write.here() {
             Some(write) => {
-                write.value = value;
-                self.write.send_with(turn, self.worker, hold)
+                write.0 = value;
+                self.write.send_with(context, self.output, hold)
             }
             None => {
                 self.next = Some((value, hold));
@@ -77,12 +80,12 @@ impl<S: Settable> Remote<S> {
         }
     }
 
-    /// Handles a finished write, if it was to this output. `Ok(true)` means that nothing is left to write.
-    pub fn back(&mut self, turn: &mut Turn, done: &mut Done) -> Option<Result<bool, Shutdown>> {
-        let Back { result, .. } = self.write.back(done)?;
+    /// Handles a finished write. `Ok(true)` means that nothing is left to write.
+    pub fn back(&mut self, context: &mut Context, finished: Finished) -> Option<Result<bool, Shutdown>> {
+        let Back { result, .. } = self.write.back(finished)?;
         let result = result.map_err(Shutdown::clone);
         Some(match self.next.take() {
-            Some((next, hold)) => self.write(turn, next, hold).and(result.map(|()| false)),
+            Some((next, hold)) => self.write(context, next, hold).and(result.map(|()| false)),
             None => result.map(|()| true),
         })
     }
@@ -92,10 +95,10 @@ impl<S: Settable> Remote<S> {
     /// # Errors
     ///
     /// The error of the write, for example "PWM write failed", unless the MCU is stopped.
-    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
-        match self.back(turn, done) {
-            Some(Ok(true)) => turn.is_safe(),
-            Some(Err(failure)) => return turn.device_failed(kind, failure),
+    pub fn settle(&mut self, context: &mut Context, kind: &str, finished: Finished) -> Result<(), Shutdown> {
+        match self.back(context, finished) {
+            Some(Ok(true)) => context.is_safe(),
+            Some(Err(failure)) => return context.device_failed(kind, failure),
             _ => {}
         }
         Ok(())

@@ -7,14 +7,13 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::{self, Write as _};
-use std::sync::atomic::{AtomicU8, Ordering};
 
 use crate::board::{Direction, Pin};
 use crate::lateness::Lateness;
 use crate::shutdown::ShutdownReason;
 use crate::time::Clock;
 
-use super::{DialectName, Mcu, OBJECTS_MAX, Oid};
+use super::{DialectName, Mcu, OBJECTS_MAX, Oid, State};
 
 /// Highest number of lines in a snapshot.
 const LINES_MAX: usize = 512;
@@ -42,8 +41,8 @@ pub struct Snapshot {
     pub stopped: Option<(ShutdownReason, Clock)>,
     /// The cause and remedy of the stop, as in the log.
     pub detail: String,
-    /// The object that still owes a shutdown value; empty if there is none.
-    pub debtor: String,
+    /// The object whose shutdown value is pending; empty if there is none.
+    pub pending: String,
     /// Whether commands wait for a bus.
     pub is_held: bool,
     /// How many moves are queued, and how many there are in all.
@@ -59,7 +58,7 @@ pub struct Snapshot {
     /// How many lines and objects there were when the snapshot was begun.
     shape: (usize, usize),
     /// How many rows are filled in, plus one for the head.
-    told: usize,
+    filled: usize,
 }
 
 /// A GPIO line in use.
@@ -170,7 +169,7 @@ impl Default for Snapshot {
             dialect: None,
             stopped: None,
             detail: String::with_capacity(TEXT_BYTES),
-            debtor: String::with_capacity(TEXT_BYTES),
+            pending: String::with_capacity(TEXT_BYTES),
             is_held: false,
             moves: (0, 0),
             lateness: Lateness::default(),
@@ -178,7 +177,7 @@ impl Default for Snapshot {
             objects: Vec::with_capacity(OBJECTS_MAX + ROWS),
             queues: Vec::with_capacity(QUEUES_MAX),
             shape: (0, 0),
-            told: 0,
+            filled: 0,
         }
     }
 }
@@ -186,7 +185,7 @@ impl Default for Snapshot {
 impl Snapshot {
     /// Call this before the snapshot is filled again.
     pub fn clear(&mut self) {
-        self.told = 0;
+        self.filled = 0;
     }
 }
 
@@ -220,19 +219,20 @@ impl fmt::Write for Room<'_> {
 impl Mcu {
     /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
     /// begins again if lines or objects came or went meanwhile. It does not allocate.
-    pub fn tell(&self, to: &mut Snapshot) -> bool {
-        let shape = (self.configuration.claims.len(), self.configuration.objects.len());
-        if to.told == 0 || to.shape != shape {
+    pub fn fill(&self, to: &mut Snapshot) -> bool {
+        let State { lines, objects, workers, .. } = &self.state;
+        let shape = (lines.len(), objects.len());
+        if to.filled == 0 || to.shape != shape {
             to.shape = shape;
-            to.told = 1;
-            self.tell_head(to);
+            to.filled = 1;
+            self.fill_head(to);
             return false;
         }
-        let (first, rows) = (to.told - 1, shape.0 + shape.1);
+        let (first, rows) = (to.filled - 1, shape.0 + shape.1);
         let next = (first + ROWS).min(rows);
         for row in first..next {
             match row.checked_sub(shape.0) {
-                None => append(&mut to.lines, self.configuration.claims[row].state()),
+                None => append(&mut to.lines, lines.state(row)),
                 Some(index) => {
                     if let Some(state) = self.object_state(index) {
                         append(&mut to.objects, state);
@@ -240,12 +240,12 @@ impl Mcu {
                 }
             }
         }
-        to.told = next + 1;
+        to.filled = next + 1;
         if next < rows {
             return false;
         }
         let queues = &mut to.queues;
-        self.workers.tell(&mut |bus, waiting| {
+        workers.report(&mut |bus, waiting| {
             let mut name = [0; NAME_BYTES];
             name.iter_mut().zip(bus.bytes()).for_each(|(to, from)| *to = from);
             append(queues, QueueState { name, waiting });
@@ -253,69 +253,35 @@ impl Mcu {
         true
     }
 
-    fn tell_head(&self, to: &mut Snapshot) {
-        to.at = self.schedule.last_read;
-        to.is_configured = self.is_finalized();
-        to.oids_allocated = self.is_allocated();
-        to.dialect = Some(self.spoken.dialect.name());
-        let last = self.last_stop();
-        let at = last.map_or(self.schedule.last_read, |(_, at)| at);
-        to.stopped = self.stop.reason.map(|reason| (reason, at));
-        match last {
-            Some((stop, _)) => put(&mut to.detail, &stop.trouble),
+    fn fill_head(&self, to: &mut Snapshot) {
+        let State { phase, scheduler, wire, moves, .. } = &self.state;
+        to.at = scheduler.last_read();
+        to.is_configured = phase.is_finalized();
+        to.oids_allocated = phase.is_allocated();
+        to.dialect = Some(wire.dialect().name());
+        to.stopped = phase.last_stop().map(|(why, at)| (why.reason, at));
+        match phase.last_stop() {
+            Some((why, _)) => put(&mut to.detail, &why.trouble),
             None => to.detail.clear(),
         }
-        put(&mut to.debtor, self.debtor().unwrap_or_default());
+        put(&mut to.pending, self.pending_value().unwrap_or_default());
         to.is_held = self.is_held();
-        to.moves = self.moves.used();
-        to.lateness.clone_from(&self.schedule.lateness);
+        to.moves = moves.used();
+        to.lateness.clone_from(scheduler.lateness());
         to.lines.clear();
         to.objects.clear();
         to.queues.clear();
     }
 
     fn object_state(&self, index: usize) -> Option<ObjectState> {
-        let object = self.configuration.objects.get(index)?.as_ref()?;
+        let oid = Oid::at(index);
+        let object = self.state.objects.get(oid)?;
         Some(ObjectState {
             oid: (index < Oid::FIRST_OWN).then_some(index as u8),
             kind: object.kind(),
-            pin: self.configuration.pins.iter().find(|(oid, _)| oid.index() == index).map(|(_, pin)| *pin),
+            pin: self.state.objects.pin(oid),
             report: object.report(),
             bus: object.counts(),
         })
-    }
-}
-
-/// The level of a line when it was last driven or read. The core or a worker writes this byte.
-#[derive(Debug)]
-pub(super) struct Level(AtomicU8);
-
-const UNKNOWN: u8 = 2;
-
-impl Level {
-    pub(super) fn of(direction: Direction) -> Level {
-        let level = Level(AtomicU8::new(UNKNOWN));
-        level.begin(direction);
-        level
-    }
-
-    /// Called when the line is set up.
-    pub(super) fn begin(&self, direction: Direction) {
-        match direction {
-            Direction::Output { level, .. } => self.set(level),
-            _ => self.0.store(UNKNOWN, Ordering::Relaxed),
-        }
-    }
-
-    #[inline]
-    pub(super) fn set(&self, level: bool) {
-        self.0.store(u8::from(level), Ordering::Relaxed);
-    }
-
-    pub(super) fn get(&self) -> Option<bool> {
-        match self.0.load(Ordering::Relaxed) {
-            UNKNOWN => None,
-            level => Some(level != 0),
-        }
     }
 }

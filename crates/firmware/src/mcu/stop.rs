@@ -1,18 +1,21 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How the MCU stops. It removes timers, drives outputs to their shutdown values and informs the host.
 //!
-//! A shutdown value that cannot be written at once is *owed*: a worker has to write it, or the write failed. A failed
-//! write is retried every [`RETRY_TICKS`]. The program watches [`Mcu::debtor`]: the guardian handles a debt that lasts.
+//! A stop drives the outputs in the table of lines itself, and asks each object with a device of its own
+//! ([`Object::make_safe`]). A shutdown value that cannot be written at once is *pending*: a worker has to write it, or the
+//! write failed. A failed write is retried every [`RETRY_TICKS`]. The program watches [`Mcu::pending_value`]. The
+//! guardian takes over if a value stays pending.
 //!
-//! The guardian cannot write some outputs ([`Object::is_guarded`]). Their debt ends after [`UNGUARDED_LIMIT`], because
-//! ending the program for it would help nobody. The MCU still retries them until the next configuration.
+//! The guardian cannot write some outputs ([`Object::is_guarded`]). The MCU waits for these no longer than
+//! [`UNGUARDED_LIMIT`], because the end of the program would help nobody. It still retries them until the next
+//! configuration.
 
 #![forbid(unsafe_code)]
 
-use crate::shutdown::{Shutdown, ShutdownReason, reason};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks};
 
-use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
+use super::{Context, Mcu, Note, Oid, Safe, State, TimerId, base};
 
 #[cfg(doc)]
 use super::Object;
@@ -24,21 +27,26 @@ pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 /// guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// The reason of a stop, and the shutdown values that are still owed.
+/// The pending shutdown values.
 #[derive(Default)]
-pub(super) struct Stop {
-    /// Why the MCU is stopped; `None` while it is not.
-    pub(super) reason: Option<ShutdownReason>,
-    /// The last stop, and its time.
-    pub(super) last: Option<(Shutdown, Clock)>,
+pub(super) struct PendingValues {
     /// Whether `shut_down` is running. A failure meanwhile must not start it again.
     under_way: bool,
-    owed: Vec<Debt>,
+    values: Vec<PendingValue>,
 }
 
-/// An object that owes a shutdown value.
-struct Debt {
-    oid: Oid,
+/// Owner of a pending shutdown value.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Subject {
+    /// An object that drives its device itself.
+    Object(Oid),
+    /// The output at this place of the table of lines.
+    Output(usize),
+}
+
+/// A pending shutdown value.
+struct PendingValue {
+    subject: Subject,
     /// The log's name for it.
     name: String,
     /// Whether writing failed.
@@ -50,174 +58,188 @@ struct Debt {
     given_up: bool,
 }
 
-impl Mcu {
-    /// Whether the MCU is stopped.
-    pub fn is_shutdown(&self) -> bool {
-        self.stop.reason.is_some()
+impl PendingValues {
+    /// Whether the MCU waits for any of them.
+    #[inline]
+    pub(super) fn are_awaited(&self) -> bool {
+        self.values.iter().any(|value| !value.given_up)
     }
+}
 
-    /// Why and when the MCU stopped; `None` while it is not stopped.
-    pub fn last_stop(&self) -> Option<(&Shutdown, Clock)> {
-        self.stop.last.as_ref().filter(|_| self.is_shutdown()).map(|(stop, at)| (stop, *at))
-    }
-
-    /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
-    /// that is already stopped does this again and keeps its first reason.
-    pub fn shut_down(&mut self, shutdown: Shutdown) {
-        if self.stop.under_way {
-            self.outbox.note(Note::Trouble(&shutdown));
-            return;
+impl State {
+    /// See [`Context::device_failed`].
+    pub(super) fn device_failed(&mut self, subject: Subject, shutdown: Shutdown) -> Result<(), Shutdown> {
+        if !self.phase.is_stopped() {
+            return Err(shutdown.of(&self.name_subject(subject, None)));
         }
-        let clock = self.now();
-        let first = self.stop.reason.is_none();
-        let reason = *self.stop.reason.get_or_insert(shutdown.reason);
-        self.stop.under_way = true;
-        if first {
-            self.stop.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
-        }
-        self.schedule.timers.clear();
-        for oid in self.oids() {
-            if let Some(mut object) = self.take(oid) {
-                object.shutdown(&mut Turn::new(self, oid));
-                self.put_back(oid, object);
-            }
-        }
-        for oid in self.oids() {
-            self.make_safe(oid);
-        }
-        self.stop.under_way = false;
-        self.retry_later();
-        let static_string_id = self.spoken.dialect.static_string_id(reason);
-        self.send(base::ShutdownReport { clock, static_string_id });
-        if first {
-            self.outbox.note(Note::Shutdown(&shutdown));
-            self.stop.last = Some((shutdown, clock));
-        } else if shutdown.reason != reason {
-            // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
-            self.outbox.note(Note::Trouble(&shutdown));
-        }
-    }
-
-    /// Returns the given shutdown as an error, which then stops the MCU. Returns `Ok` if the MCU is already stopped
-    /// (the firmware's `try_shutdown`).
-    ///
-    /// # Errors
-    ///
-    /// `shutdown`, unless the MCU is stopped.
-    pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
-        match self.stop.reason {
-            Some(_) => Ok(()),
-            None => Err(shutdown),
-        }
-    }
-
-    /// See [`Turn::device_failed`].
-    pub(super) fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
-        if self.stop.reason.is_none() {
-            return Err(shutdown);
-        }
-        let known = self.stop.owed.iter_mut().find(|debt| debt.oid == oid);
-        let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
-        // It is retried twenty times a second, but logged once.
-        if !again {
-            let trouble = self.blame(shutdown, kind, oid);
-            self.outbox.note(Note::Trouble(&trouble));
-        }
-        self.retry_later();
+        self.note_failure(subject, None, shutdown);
         Ok(())
     }
 
-    /// See [`Turn::warn`].
+    /// The log's name for a subject. `kind` is the kind of an object that is not in the table, because it is called.
+    fn name_subject(&self, subject: Subject, kind: Option<&str>) -> String {
+        let oid = match subject {
+            Subject::Object(oid) => oid,
+            Subject::Output(place) => self.owner(place),
+        };
+        let kind = kind.or_else(|| self.objects.get(oid).map(|object| object.kind()));
+        self.name_object(kind.unwrap_or("output"), oid)
+    }
+
+    /// Logs a failure of a stopped MCU. The shutdown value is retried later.
+    pub(super) fn note_failure(&mut self, subject: Subject, kind: Option<&str>, shutdown: Shutdown) {
+        let known = self.pending.values.iter_mut().find(|value| value.subject == subject);
+        let again = known.is_some_and(|value| std::mem::replace(&mut value.failed, true));
+        // It is retried twenty times a second, but logged once.
+        if !again {
+            let trouble = shutdown.of(&self.name_subject(subject, kind));
+            self.wire.note(Note::Trouble(&trouble));
+        }
+        self.retry_later();
+    }
+
+    /// See [`Context::warn`].
     pub(super) fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
         let trouble = self.blame(trouble, kind, oid);
-        self.outbox.note(Note::Warning(&trouble));
+        self.wire.note(Note::Warning(&trouble));
     }
 
-    /// See [`Turn::is_safe`].
-    pub(super) fn is_safe(&mut self, oid: Oid) {
-        let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };
-        let debt = self.stop.owed.swap_remove(place);
-        if debt.failed {
-            self.outbox.note(Note::Safe(&debt.name));
+    /// An output or the outputs of an object are at their shutdown values.
+    pub(super) fn is_safe(&mut self, subject: Subject) {
+        let Some(place) = self.pending.values.iter().position(|value| value.subject == subject) else { return };
+        let value = self.pending.values.swap_remove(place);
+        if value.failed {
+            self.wire.note(Note::Safe(&value.name));
         }
     }
 
-    /// The log's name of an object that owes its shutdown value; `None` if nothing is owed.
-    pub fn debtor(&self) -> Option<&str> {
-        self.stop.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
+    fn make_safe(&mut self, subject: Subject) {
+        let oid = match subject {
+            Subject::Object(oid) => oid,
+            Subject::Output(place) => return self.make_output_safe(place),
+        };
+        let Some(mut object) = self.objects.take(oid) else { return };
+        let safe = object.make_safe(&mut Context::new(self, oid));
+        let guarded = object.is_guarded();
+        self.objects.put_back(oid, object);
+        self.note_safety(subject, guarded, safe);
     }
 
-    /// Whether any shutdown value is owed.
-    #[inline]
-    pub fn owes(&self) -> bool {
-        self.stop.owed.iter().any(|debt| !debt.given_up)
-    }
-
-    fn oids(&self) -> impl Iterator<Item = Oid> + use<> {
-        (0..self.configuration.objects.len()).map(Oid::at)
-    }
-
-    fn make_safe(&mut self, oid: Oid) {
-        let Some(mut object) = self.take(oid) else { return };
-        let safe = object.make_safe(&mut Turn::new(self, oid));
-        let (kind, guarded) = (object.kind(), object.is_guarded());
-        self.put_back(oid, object);
-        if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {
-            let name = self.name_object(kind, oid);
-            let since = self.schedule.last_read;
-            self.stop.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
+    /// Notes the result of an attempt to reach a shutdown value.
+    pub(super) fn note_safety(&mut self, subject: Subject, guarded: bool, safe: Result<Safe, Shutdown>) {
+        if !matches!(safe, Ok(Safe::Now)) && !self.pending.values.iter().any(|value| value.subject == subject) {
+            let name = self.name_subject(subject, None);
+            let since = self.scheduler.last_read();
+            self.pending.values.push(PendingValue { subject, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
-            Ok(Safe::Now) => self.is_safe(oid),
+            Ok(Safe::Now) => self.is_safe(subject),
             Ok(Safe::Later) => {}
-            Err(trouble) => {
-                // The MCU is stopped, so this logs the failure and returns `Ok`.
-                let _ = self.device_failed(oid, kind, trouble);
-            }
+            Err(failure) => self.note_failure(subject, None, failure),
         }
     }
 
     /// Starts the timer of the next attempt. It is needed if a shutdown value could not be written, or if the MCU will
     /// stop waiting for one.
     fn retry_later(&mut self) {
-        if self.stop.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
-            self.schedule.timers.remove(TimerId::RETRY);
-            let at = self.schedule.last_read + RETRY_TICKS;
-            self.schedule.timers.insert(at, TimerId::RETRY);
+        if self.pending.values.iter().any(|value| value.failed || !value.guarded && !value.given_up) {
+            self.scheduler.cancel(TimerId::RETRY);
+            let at = self.scheduler.last_read() + RETRY_TICKS;
+            self.scheduler.start(TimerId::RETRY, at);
         }
     }
 
     /// Retries the shutdown values that could not be written. It stops waiting for overdue ones that the guardian
     /// cannot write.
     pub(super) fn retry(&mut self) {
-        let now = self.now();
-        for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
-            if now.since(debt.since) >= i64::from(UNGUARDED_LIMIT.0) {
-                debt.given_up = true;
+        let now = self.scheduler.now();
+        for value in self.pending.values.iter_mut().filter(|value| !value.guarded && !value.given_up) {
+            if now.since(value.since) >= i64::from(UNGUARDED_LIMIT.0) {
+                value.given_up = true;
                 let cause = format!(
                     "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
-                    debt.name,
+                    value.name,
                     UNGUARDED_LIMIT.as_ms()
                 );
                 let stop = Shutdown::because(reason::BUS_HANGS, cause);
-                self.outbox.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
+                self.wire.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
             }
         }
-        for place in (0..self.stop.owed.len()).rev() {
-            let failed = self.stop.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
-            if let Some(oid) = failed {
-                self.make_safe(oid);
+        for place in (0..self.pending.values.len()).rev() {
+            let failed = self.pending.values.get(place).filter(|value| value.failed).map(|value| value.subject);
+            if let Some(subject) = failed {
+                self.make_safe(subject);
             }
         }
         self.retry_later();
     }
+}
+
+impl Mcu {
+    /// Whether the MCU is stopped.
+    pub fn is_shutdown(&self) -> bool {
+        self.state.phase.is_stopped()
+    }
+
+    /// Why and when the MCU stopped; `None` while it is not stopped.
+    pub fn last_stop(&self) -> Option<(&Shutdown, Clock)> {
+        self.state.phase.last_stop()
+    }
+
+    /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
+    /// that is already stopped does this again and keeps its first reason.
+    pub fn shut_down(&mut self, shutdown: Shutdown) {
+        let state = &mut self.state;
+        if state.pending.under_way {
+            state.wire.note(Note::Trouble(&shutdown));
+            return;
+        }
+        let clock = state.scheduler.now();
+        let again = state.phase.stop(shutdown, clock);
+        state.pending.under_way = true;
+        if again.is_none() {
+            state.pending.values.iter_mut().for_each(|value| (value.since, value.given_up) = (clock, false));
+        }
+        state.scheduler.clear();
+        for oid in state.objects.oids() {
+            if let Some(mut object) = state.objects.take(oid) {
+                object.shutdown(&mut Context::new(state, oid));
+                state.objects.put_back(oid, object);
+            }
+        }
+        for place in 0..state.lines.len() {
+            state.make_output_safe(place);
+        }
+        for oid in state.objects.oids() {
+            state.make_safe(Subject::Object(oid));
+        }
+        state.pending.under_way = false;
+        state.retry_later();
+        let Some((why, _)) = state.phase.last_stop() else { return };
+        let static_string_id = state.wire.dialect().static_string_id(why.reason);
+        state.wire.send(base::ShutdownReport { clock, static_string_id });
+        match again {
+            None => state.wire.note(Note::Shutdown(why)),
+            // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
+            Some(again) if again.reason == why.reason => {}
+            Some(again) => state.wire.note(Note::Trouble(&again)),
+        }
+    }
+
+    /// The log's name of an object whose shutdown value is pending; `None` without one.
+    pub fn pending_value(&self) -> Option<&str> {
+        self.state.pending.values.iter().find(|value| !value.given_up).map(|value| value.name.as_str())
+    }
+
+    /// Whether any shutdown value is pending.
+    #[inline]
+    pub fn has_pending_values(&self) -> bool {
+        self.state.pending.are_awaited()
+    }
 
     pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
-        if self.stop.reason.take().is_none() {
-            let what = "clear_shutdown came while the MCU was not stopped";
-            return Err(Shutdown::by_host(reason::NOT_SHUTDOWN, what));
-        }
-        self.hold_again();
+        self.state.phase.clear_shutdown()?;
+        self.state.hold_again();
         Ok(())
     }
 }

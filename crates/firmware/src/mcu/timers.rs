@@ -7,7 +7,7 @@ use crate::time::Clock;
 
 use super::Oid;
 
-/// A timer of an object. A number tells the timers of one object apart.
+/// A timer of an object. The timers of an object have different numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timer {
     number: u8,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The wire between the host and the MCU, as far as the dictionary tells the host about it.
+//! The wire between the host and the MCU, as the dictionary describes it to the host.
 
 #![forbid(unsafe_code)]
 
@@ -19,7 +19,7 @@ pub enum Wire {
 }
 
 impl Wire {
-    /// The constant that tells klippy the wire's rate, and its value.
+    /// The constant of the wire's rate, and its value.
     pub fn rate(&self) -> Option<(&'static str, u32)> {
         match self {
             Wire::Terminal => None,
@@ -88,7 +88,7 @@ impl CanNode {
         CanNode { uuid, frequency, node_id: AtomicU32::new(0), health: Default::default() }
     }
 
-    /// Bits per second, if the interface tells. klippy does not send faster (`CANBUS_FREQUENCY`).
+    /// Bits per second, if the interface has it. klippy does not send faster (`CANBUS_FREQUENCY`).
     pub fn frequency(&self) -> Option<u32> {
         Some(self.frequency.load(Ordering::Relaxed)).filter(|frequency| *frequency > 0)
     }

@@ -294,7 +294,7 @@ fn a_sensor_needs_an_spi_device() {
     }
 }
 
-/// An errand that cannot be sent stays with its sensor. The sensor gets an error each time.
+/// A job that cannot be sent stays with its sensor. The sensor gets an error each time.
 #[test]
 fn a_sensor_whose_device_has_no_bus_loses_nothing() {
     let config =

@@ -311,6 +311,15 @@ fn a_pin_that_is_set_once_belongs_where_the_output_that_takes_it_does() {
 }
 
 /// klippy's `[duplicate_pin_override]`: two users of one line.
+/// The MCU and the guardian drive a heater off, whatever else was set on its line.
+#[test]
+fn a_line_that_is_set_beside_its_object_keeps_the_shutdown_value_of_the_object() {
+    let mut rig = Rig::configured(&[HEATER, "set_digital_out pin=20 value=1"]);
+    assert!(rig.bench.level(PIN) && !rig.bench.shutdown_value(PIN));
+    rig.send("emergency_stop");
+    assert!(!rig.bench.level(PIN));
+}
+
 #[test]
 fn two_outputs_may_share_a_line() {
     let mut rig = Rig::configured(&[FAN, "config_digital_out oid=1 pin=20 value=0 default_value=0 max_duration=0"]);

@@ -139,7 +139,7 @@ fn a_shutdown_drives_the_lines_low_and_the_display_starts_anew() {
         rig.run_until(1);
         rig.send("emergency_stop");
         rig.run_until(100_000);
-        assert!(!rig.mcu.owes());
+        assert!(!rig.mcu.has_pending_values());
         for pin in &pins {
             assert!(!rig.bench.level(*pin), "pin {pin}");
             assert!(!rig.bench.shutdown_value(*pin), "pin {pin}");
@@ -179,10 +179,10 @@ fn a_line_that_is_gone_stops_the_mcu_and_is_tried_again() {
         rig.send(command);
         assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
         rig.run_until(10_000_000);
-        assert!(rig.mcu.owes());
+        assert!(rig.mcu.has_pending_values());
         rig.bench.state().broken.clear();
         rig.run_until(20_000_000);
-        assert!(!rig.mcu.owes() && !rig.bench.level(pin));
+        assert!(!rig.mcu.has_pending_values() && !rig.bench.level(pin));
     }
 }
 
@@ -195,7 +195,7 @@ fn a_display_behind_an_expander_works() {
     assert_eq!(bytes(&hear_hd44780(&rig))[0].2, 0x41);
     rig.send("emergency_stop");
     rig.run_until(100_000);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
 }
 
 #[test]

@@ -267,8 +267,8 @@ fn a_reading_that_is_not_back_in_time_is_an_error_and_counted() {
 
 #[test]
 fn a_clock_that_may_have_switched_the_chip_off_is_an_error() {
-    // The real time may be a tick longer.
-    for (write_ticks, good) in [(1499, true), (1500, false)] {
+    // A pulse is two writes, and a wait of 11 ticks. The real time may be a tick longer.
+    for (write_ticks, good) in [(1494, true), (1495, false)] {
         let (mut rig, _chip) = rig(7, 1, 0);
         rig.send(QUERY);
         rig.bench.state().write_ticks = write_ticks;

@@ -33,7 +33,7 @@ fn heard(heard: &Heard) -> Vec<(Vec<u8>, usize)> {
 }
 
 #[test]
-fn a_register_is_written_and_read_as_one_conversation() {
+fn a_register_is_written_and_read_as_one_message() {
     let mut rig = Rig::configured(DEVICE);
     let chip = plug(&rig, &[]);
     for (command, response) in [

@@ -51,7 +51,7 @@ fn device(generation: Generation) -> &'static [&'static str] {
 
 type Heard = Arc<Mutex<Vec<(Vec<u8>, usize)>>>;
 
-/// A chip that counts up from the first byte written to it. It answers with `status` once `after` conversations are
+/// A chip that counts up from the first byte written to it. It answers with `status` once `after` transfers are
 /// over.
 fn plug_i2c(rig: &Rig, after: usize, status: Result<(), BusStatus>) -> Heard {
     let heard = Heard::default();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One order: a command's conversation holds back the commands behind it, and nothing else.
+//! One order: a command's job holds back the commands behind it, and nothing else.
 
 use pinion_testbench::board::SPI_CHIPS;
 use pinion_testbench::rig::Rig;

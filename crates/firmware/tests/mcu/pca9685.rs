@@ -66,17 +66,18 @@ fn a_chip_is_set_up_once_and_its_outputs_get_their_values() {
     assert_eq!(bytes(&chip), set_up);
 }
 
+/// The chip's set-up takes 25,000 ticks, for its oscillator.
 #[test]
 fn queued_values_go_to_the_chip_at_their_instants() {
     let (mut rig, chip) = rig(0, &[OUTPUT, FREE]);
     bytes(&chip);
-    for (at, value) in [(1000, 4096), (50_000, 1), (90_000, 0)] {
+    for (at, value) in [(26_000, 4096), (50_000, 1), (90_000, 0)] {
         rig.send(&format!("queue_pca9685_out oid=0 clock=@{at} value={value}"));
     }
     rig.run_until(1_000_000);
     assert_eq!(
         heard(&chip),
-        [(1000, vec![14, 0, 0x10, 0, 0]), (50_000, vec![14, 0, 0, 1, 0]), (90_000, vec![14, 0, 0, 0, 0x10])]
+        [(26_000, vec![14, 0, 0x10, 0, 0]), (50_000, vec![14, 0, 0, 1, 0]), (90_000, vec![14, 0, 0, 0, 0x10])]
     );
     assert_eq!(rig.shutdown(), None, "its default value may stay");
 }
@@ -84,12 +85,12 @@ fn queued_values_go_to_the_chip_at_their_instants() {
 #[test]
 fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
     for (commands, text) in [
-        (&["queue_pca9685_out oid=0 clock=@1000 value=9"][..], "Missed scheduling of next pca9685 event"),
+        (&["queue_pca9685_out oid=0 clock=@26000 value=9"][..], "Missed scheduling of next pca9685 event"),
         (
-            &["queue_pca9685_out oid=0 clock=@1000 value=9", "queue_pca9685_out oid=0 clock=@101001 value=0"],
+            &["queue_pca9685_out oid=0 clock=@26000 value=9", "queue_pca9685_out oid=0 clock=@126001 value=0"],
             "Scheduled pca9685 event will exceed max_duration",
         ),
-        (&["queue_pca9685_out oid=0 clock=@1000 value=4097"], "Invalid pca9685 value"),
+        (&["queue_pca9685_out oid=0 clock=@26000 value=4097"], "Invalid pca9685 value"),
     ] {
         let (mut rig, chip) = rig(0, &[OUTPUT, FREE]);
         bytes(&chip);
@@ -101,7 +102,7 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
         let last = |register: u8| told.iter().rfind(|bytes| bytes[0] == register);
         assert_eq!(last(14), Some(&vec![14, 0, 0, 0, 0x10]));
         assert_eq!(last(66), Some(&vec![66, 0, 0x10, 0, 0]));
-        assert!(!rig.mcu.owes());
+        assert!(!rig.mcu.has_pending_values());
     }
 }
 
@@ -116,9 +117,9 @@ fn a_slow_chip_gets_the_newest_value_and_its_shutdown_value_last() {
     }
     rig.run_until(now + 40_000);
     rig.send("emergency_stop");
-    assert!(rig.mcu.owes());
+    assert!(rig.mcu.has_pending_values());
     rig.run_until(now + 200_000);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
     assert_eq!(bytes(&chip), [vec![66, 0, 0, 1, 0], vec![66, 0, 0x10, 0, 0]]);
 }
 
@@ -173,10 +174,10 @@ fn a_chip_that_goes_silent_stops_the_mcu_and_is_tried_until_it_answers() {
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
     rig.run_until(now + 20_000_000);
     assert_eq!(rig.shutdown().as_deref(), Some("Unable to update PCA9685 value"));
-    assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
+    assert_eq!(rig.mcu.pending_value(), Some("PCA9685"));
     let chip = plug(&rig);
     rig.run_until(now + 40_000_000);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
     assert_eq!(bytes(&chip), [[14, 0, 0, 0, 0x10], [66, 0, 0x10, 0, 0]]);
     rig.send("config_reset");
     rig.forget_responses();
@@ -193,8 +194,8 @@ fn a_value_that_is_not_acknowledged_is_written_again() {
         nacks -= 1;
         if nacks >= 0 { Err(BusStatus::Nack) } else { Ok(()) }
     });
-    rig.send("queue_pca9685_out oid=1 clock=@1000 value=1");
-    rig.run_until(2000);
+    rig.send("queue_pca9685_out oid=1 clock=@26000 value=1");
+    rig.run_until(27_000);
     assert_eq!(rig.shutdown(), None);
     assert_eq!(bytes(&chip), [[66, 0, 0, 1, 0]; 3]);
 }
@@ -219,11 +220,11 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     let now = rig.now();
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=2", now + 9000));
-    // The guardian takes over after a second without a heartbeat. There is no heartbeat while this value is owed.
+    // The guardian takes over after a second without a heartbeat. There is no heartbeat while this value is pending.
     rig.run_until(now + 24_000_000);
-    assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
+    assert_eq!(rig.mcu.pending_value(), Some("PCA9685"));
     rig.run_until(now + 30_000_000);
-    assert_eq!(rig.mcu.debtor(), None);
+    assert_eq!(rig.mcu.pending_value(), None);
     let notes = rig.notes();
     let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not taken its shutdown values for 500 ms"));
     assert_eq!(given_up.count(), 1, "{notes:?}");

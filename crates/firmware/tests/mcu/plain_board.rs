@@ -144,7 +144,7 @@ fn a_board_without_serial_ports_takes_lines_for_them() {
 
 /// The chip on the wire is heard only while the line is an input.
 #[test]
-fn a_plain_line_turns_round_in_a_conversation() {
+fn a_plain_line_turns_round_in_a_message() {
     let converse = |mut rig: Rig| {
         rig.configure(&["config_tmcuart oid=0 rx_pin=10 pull_up=1 tx_pin=10 bit_time=1250"]);
         let reply = 100_000;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A shutdown value that cannot be written is owed. It is retried, and nothing is forgotten before it is written.
+//! A shutdown value that cannot be written is pending. It is retried, and nothing is forgotten before it is written.
 
 use pinion_testbench::board::{PWM, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
@@ -29,10 +29,10 @@ fn what_can_not_be_written_is_tried_again_until_it_is() {
         rig.bench.state().broken.insert(broken);
         rig.send("emergency_stop");
         rig.run_until(SOME_ATTEMPTS);
-        assert_eq!(rig.mcu.debtor(), Some(name));
+        assert_eq!(rig.mcu.pending_value(), Some(name));
         rig.bench.state().broken.clear();
         rig.run_until(2 * SOME_ATTEMPTS);
-        assert!(!rig.mcu.owes(), "{name}");
+        assert!(!rig.mcu.has_pending_values(), "{name}");
         let notes = rig.notes();
         let troubles: Vec<_> = notes.iter().filter(|note| note.starts_with("trouble: ")).collect();
         assert!(troubles.len() == 1 && troubles[0].contains(name), "{notes:?}");

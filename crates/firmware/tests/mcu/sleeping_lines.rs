@@ -56,11 +56,11 @@ fn a_shutdown_reaches_it_through_what_is_under_way() {
     rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=1");
     rig.run_until(2000);
     rig.send("emergency_stop");
-    assert!(rig.mcu.owes());
+    assert!(rig.mcu.has_pending_values());
     rig.run_until(100_000);
     assert_eq!(rig.edges(PIN), [(21_000, 1), (61_000, 0)]);
     assert_eq!(rig.edges(PIN + 1), [(41_000, 0)]);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
 }
 
 #[test]
@@ -134,10 +134,10 @@ fn a_chip_that_fails_stops_the_mcu_and_is_tried_until_it_answers() {
     rig.send("update_digital_out oid=0 value=0");
     assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
     rig.run_until(40_000_000);
-    assert_eq!(rig.mcu.debtor(), Some("digital output oid 0 (gpio50)"));
+    assert_eq!(rig.mcu.pending_value(), Some("digital output oid 0 (gpio50)"));
     rig.bench.state().broken.clear();
     rig.run_until(50_000_000);
-    assert_eq!(rig.mcu.debtor(), None);
+    assert_eq!(rig.mcu.pending_value(), None);
     assert!(!rig.bench.level(PIN));
     let notes = rig.notes();
     assert_eq!(notes.iter().filter(|note| note.starts_with("trouble: GPIO line write failed")).count(), 1, "{notes:?}");
@@ -242,7 +242,7 @@ fn an_output_is_written_again_before_that_stops_the_mcu() {
     rig.bench.state().nacks.insert(PIN, 2);
     rig.send("emergency_stop");
     rig.run_until(40_000);
-    assert_eq!((rig.edges(PIN), rig.mcu.owes()), (vec![(40_000, 0)], false));
+    assert_eq!((rig.edges(PIN), rig.mcu.has_pending_values()), (vec![(40_000, 0)], false));
     let notes = rig.notes();
     assert!(!notes.iter().any(|note| note.contains("trouble")), "{notes:?}");
 }

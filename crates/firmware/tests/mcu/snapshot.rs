@@ -6,14 +6,14 @@ use pinion_firmware::mcu::{BusCounts, LineUse, Present, Snapshot};
 
 use pinion_testbench::rig::Rig;
 
-fn tell(rig: &Rig) -> Snapshot {
+fn snapshot(rig: &Rig) -> Snapshot {
     let mut snapshot = Snapshot::default();
-    while !rig.mcu.tell(&mut snapshot) {}
+    while !rig.mcu.fill(&mut snapshot) {}
     snapshot
 }
 
 fn level(rig: &Rig, pin: u32) -> (LineUse, Option<bool>) {
-    let line = tell(rig).lines.into_iter().find(|line| line.pin == Pin(pin)).unwrap();
+    let line = snapshot(rig).lines.into_iter().find(|line| line.pin == Pin(pin)).unwrap();
     (line.use_, line.level)
 }
 
@@ -42,11 +42,12 @@ fn levels_are_those_of_the_last_write_or_look() {
             assert_eq!(level(&rig, 6).1, Some(is_high));
         }
         rig.send("emergency_stop");
-        let stopped = tell(&rig);
+        let stopped = snapshot(&rig);
         assert!(stopped.stopped.is_some() && stopped.detail.starts_with("the host asked for it"));
-        assert_eq!(level(&rig, 200).1, Some(false), "the shutdown value");
+        rig.run_until(rig.now() + u64::from(answer_ticks));
+        assert_eq!(level(&rig, 200).1, Some(false), "the shutdown value, once it is written");
         rig.send("config_reset");
-        let anew = tell(&rig);
+        let anew = snapshot(&rig);
         assert!(anew.stopped.is_none() && anew.detail.is_empty() && anew.lines.is_empty() && anew.objects.is_empty());
     }
 }
@@ -56,7 +57,7 @@ fn why_it_stopped_comes_with_what_helps() {
     let mut rig = Rig::new();
     rig.send("emergency_stop");
     // A FIRMWARE_RESTART begins this way.
-    let detail = tell(&rig).detail.to_string();
+    let detail = snapshot(&rig).detail.to_string();
     assert!(
         detail.starts_with("the host asked for it (FIRMWARE_RESTART, M112 or an error): see klippy.log"),
         "{detail}"
@@ -66,7 +67,7 @@ fn why_it_stopped_comes_with_what_helps() {
     rig.run_until(2000);
     rig.stall_until(6_000_000);
     rig.run_turns(200);
-    let detail = tell(&rig).detail.to_string();
+    let detail = snapshot(&rig).detail.to_string();
     assert!(detail.starts_with("events are ") && detail.contains("real time (-r, as the service does)"), "{detail}");
 }
 
@@ -76,12 +77,12 @@ fn a_snapshot_begins_anew_where_objects_come_meanwhile() {
     rig.send("allocate_oids count=20");
     rig.send("config_endstop oid=0 pin=6 pull_up=1");
     let mut snapshot = Snapshot::default();
-    assert!(!rig.mcu.tell(&mut snapshot), "the head");
+    assert!(!rig.mcu.fill(&mut snapshot), "the head");
     for oid in 1..18 {
         rig.send(&format!("config_endstop oid={oid} pin={} pull_up=1", 10 + oid));
-        rig.mcu.tell(&mut snapshot);
+        rig.mcu.fill(&mut snapshot);
     }
-    while !rig.mcu.tell(&mut snapshot) {}
+    while !rig.mcu.fill(&mut snapshot) {}
     assert_eq!((snapshot.lines.len(), snapshot.objects.len()), (18, 18));
     assert!(!snapshot.is_configured && snapshot.oids_allocated);
     let oids: Vec<_> = snapshot.objects.iter().filter_map(|object| object.oid).collect();
@@ -101,7 +102,7 @@ fn what_fails_on_a_bus_is_counted_and_what_is_tried_again() {
         Ok(())
     });
     rig.configure(&["config_i2c oid=0", "i2c_set_bus oid=0 i2c_bus=0 rate=400000 address=64"]);
-    let counts = |rig: &Rig| tell(rig).objects[0].bus.unwrap();
+    let counts = |rig: &Rig| snapshot(rig).objects[0].bus.unwrap();
     assert_eq!(counts(&rig), BusCounts::default());
     rig.ask("i2c_transfer oid=0 write= read_len=2");
     let BusCounts { transfers, errors, retries } = counts(&rig);
@@ -128,14 +129,14 @@ fn calls_to_lines_of_expanders_to_adcs_and_to_pwm_channels_are_counted() {
     rig.send("queue_pwm_out oid=4 clock=@2000 value=300");
     rig.run_until(10_000);
     assert_eq!(rig.shutdown(), None);
-    let told = tell(&rig);
+    let filled = snapshot(&rig);
     let counts = |transfers, errors, retries| Some(BusCounts { transfers, errors, retries });
-    let line = |pin| told.lines.iter().find(|line| line.pin == Pin(pin)).unwrap().bus;
+    let line = |pin| filled.lines.iter().find(|line| line.pin == Pin(pin)).unwrap().bus;
     assert_eq!(line(200), counts(2, 1, 1));
     // There are two looks. Three tries fail in the first, and one in the second.
     assert_eq!(line(201), counts(5, 4, 3));
     assert_eq!(line(6), None, "the core reads it");
-    assert_eq!((told.objects[3].bus, told.objects[4].bus), (counts(3, 2, 2), counts(2, 1, 1)));
+    assert_eq!((filled.objects[3].bus, filled.objects[4].bus), (counts(3, 2, 2), counts(2, 1, 1)));
 }
 
 #[test]
@@ -150,13 +151,13 @@ fn values_and_queues_are_told() {
     rig.send("queue_step oid=1 interval=20000 count=5 add=0");
     rig.send("queue_step oid=1 interval=20000 count=5 add=0");
     rig.run_until(50_000);
-    let told = tell(&rig);
-    assert_eq!(told.objects[0].report.value, Some(Present::Pwm(300)));
-    assert_eq!(told.objects[0].report.queued, 1);
+    let filled = snapshot(&rig);
+    assert_eq!(filled.objects[0].report.value, Some(Present::Pwm(300)));
+    assert_eq!(filled.objects[0].report.queued, 1);
     let position = rig.ask("stepper_get_position oid=1");
     assert!(position.ends_with(" pos=-2"), "{position}");
-    assert_eq!(told.objects[1].report.value, Some(Present::Steps(-2)));
-    assert_eq!(told.objects[1].report.queued, 1);
-    assert_eq!(told.moves.0, 2);
-    assert!(told.lateness.samples() > 0);
+    assert_eq!(filled.objects[1].report.value, Some(Present::Steps(-2)));
+    assert_eq!(filled.objects[1].report.queued, 1);
+    assert_eq!(filled.moves.0, 2);
+    assert!(filled.lateness.samples() > 0);
 }

@@ -91,7 +91,7 @@ fn a_message_that_can_not_be_sent_keeps_no_one_from_the_next_configuration() {
     rig.send("emergency_stop");
     rig.begin("config_reset");
     rig.run_until(24_000_000);
-    assert!(rig.mcu.is_held() && rig.mcu.owes());
+    assert!(rig.mcu.is_held() && rig.mcu.has_pending_values());
     rig.run_until(30_000_000);
     assert!(!rig.mcu.is_held());
     assert!(rig.notes().iter().any(|note| note.contains("SPI shutdown message oid 1 has not taken")));

@@ -597,8 +597,8 @@ fn no_wait_is_longer_than_a_short_pulse() {
 fn the_core_waits_for_50_us_at_most() {
     let mut rig = Rig::configured(&[]);
     let now = rig.mcu.now();
-    rig.mcu.spin_until(now + Ticks(1000));
+    rig.mcu.context().spin_until(now + Ticks(1000));
     assert_eq!(rig.mcu.now(), now + Ticks(1000));
-    rig.mcu.spin_until(now + Ticks(u32::MAX));
+    rig.mcu.context().spin_until(now + Ticks(u32::MAX));
     assert_eq!(rig.mcu.now(), now + Ticks(1000) + SPIN_MAX);
 }

@@ -15,7 +15,7 @@ const MAX6675: u8 = 3;
 const QUERY: &str =
     "query_thermocouple oid=1 clock=@1000 rest_ticks=10000 min_value=100 max_value=4294967040 max_invalid_count=3";
 
-/// A chip that takes `answer_ticks` for a conversation. `chip` answers each transfer.
+/// A chip that takes `answer_ticks` for a job. `chip` answers each transfer.
 fn rig(kind: u8, answer_ticks: u32, mut chip: impl FnMut(&mut [u8]) + Send + 'static) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().answer_ticks = answer_ticks;

@@ -254,7 +254,7 @@ fn a_shutdown_leaves_the_line_high_and_says_nothing_more() {
         assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
         rig.run_until(1_000_000);
         assert_eq!(rig.responses(), [""; 0]);
-        assert!(rig.bench.level(TX) && !rig.mcu.owes());
+        assert!(rig.bench.level(TX) && !rig.mcu.has_pending_values());
         assert!(matches!(rig.bench.state().directions[&TX], Direction::Output { level: true, .. }));
         // The UART works in the next configuration.
         rig.send("config_reset");
@@ -277,7 +277,7 @@ fn a_line_that_is_gone_stops_the_mcu() {
         assert_eq!(rig.shutdown().as_deref(), Some(reason));
         rig.bench.state().broken.clear();
         rig.run_until(10_000_000);
-        assert!(!rig.mcu.owes() && rig.bench.level(TX));
+        assert!(!rig.mcu.has_pending_values() && rig.bench.level(TX));
     }
 }
 
@@ -411,7 +411,7 @@ fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
     assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
     rig.run_until(10_000_000);
     assert_eq!(rig.responses(), [""; 0]);
-    assert!(!rig.mcu.owes());
+    assert!(!rig.mcu.has_pending_values());
 }
 
 #[test]

@@ -107,8 +107,8 @@ pub(crate) struct Core {
     /// The link was not yet woken for some finished blocks.
     untold: bool,
     polling: PollBudget,
-    /// The output that the guardian knows to be owed its shutdown value.
-    debtor: Option<String>,
+    /// The output whose shutdown value is pending, as the guardian knows.
+    pending: Option<String>,
     snapshots: SnapshotWriter,
     trace_writer: TraceWriter,
 }
@@ -161,7 +161,7 @@ impl Core {
             block: None,
             yielded: 0,
             stops_taken: 0,
-            debtor: None,
+            pending: None,
             snapshots,
             trace_writer,
         }
@@ -185,7 +185,7 @@ impl Core {
             }
             self.heartbeat.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
-            self.tell_debts();
+            self.tell_pending();
             self.waiter.ran(self.mcu.last_read());
             if behind {
                 self.record();
@@ -277,31 +277,31 @@ impl Core {
     }
 
     /// Tells the guardian which output is owed its shutdown value.
-    fn tell_debts(&mut self) {
-        if !self.mcu.owes() {
-            if self.debtor.take().is_some() {
+    fn tell_pending(&mut self) {
+        if !self.mcu.has_pending_values() {
+            if self.pending.take().is_some() {
                 self.heartbeat.clear_pending(self.mcu.last_read());
             }
             return;
         }
-        let debtor = self.mcu.debtor();
-        if debtor != self.debtor.as_deref() {
-            self.heartbeat.set_pending(debtor.unwrap_or_default(), self.mcu.last_read());
-            self.debtor = debtor.map(str::to_owned);
+        let pending = self.mcu.pending_value();
+        if pending != self.pending.as_deref() {
+            self.heartbeat.set_pending(pending.unwrap_or_default(), self.mcu.last_read());
+            self.pending = pending.map(str::to_owned);
         }
     }
 
     /// Waits until the outputs have their shutdown values.
     fn end(mut self) -> Left {
         let deadline = monotonic() + LAST_WRITES;
-        while self.mcu.owes() && monotonic() < deadline {
+        while self.mcu.has_pending_values() && monotonic() < deadline {
             self.mcu.run_timers();
             self.mcu.run_workers();
-            self.tell_debts();
+            self.tell_pending();
             self.heartbeat.beat(self.mcu.now(), false);
             thread::park_timeout(Duration::from_millis(1));
         }
-        let left = self.mcu.debtor().map_or(Left::Safe, |debtor| Left::Owing(debtor.to_owned()));
+        let left = self.mcu.pending_value().map_or(Left::Safe, |pending| Left::Owing(pending.to_owned()));
         // This beat gives workers and devices time to end.
         self.heartbeat.beat(self.mcu.now(), false);
         left
@@ -455,7 +455,7 @@ struct Calls<'a> {
 }
 
 impl Calls<'_> {
-    /// Whether there is work: an errand is finished, or a command may run. A stop request behind a command that may not
+    /// Whether there is work: a job is finished, or a command may run. A stop request behind a command that may not
     /// run is work too.
     #[inline]
     fn any(&self) -> bool {

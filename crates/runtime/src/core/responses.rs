@@ -14,7 +14,7 @@ use nix::sys::eventfd::{EfdFlags, EventFd};
 use rtrb::{Consumer, Producer, RingBuffer};
 
 use pinion_firmware::lateness::us;
-use pinion_firmware::mcu::{Note, Outbox};
+use pinion_firmware::mcu::{DeviceWarning, Note, Outbox};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_sync::progress::Progress;
 use pinion_sync::sleep_flag::SleepFlag;
@@ -151,6 +151,9 @@ impl Outbox for ResponseWriter {
         match note {
             Note::Shutdown(shutdown) => self.stop_line("shutdown: ", gravity(shutdown), 0, shutdown),
             Note::Warning(shutdown) => self.stop_line("", Level::Warn, LINES_SPARE, shutdown),
+            Note::Device(DeviceWarning { kind, trouble }) => {
+                self.line(kind.len(), Level::Warn, LINES_SPARE, format_args!("{trouble}"));
+            }
             Note::Trouble(shutdown) => self.stop_line("while shut down: ", gravity(shutdown), LINES_SPARE, shutdown),
             Note::Safe(name) => line("", format_args!("{name} is at its shutdown value after all")),
             Note::Lateness(lateness, margin) => {

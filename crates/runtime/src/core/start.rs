@@ -10,7 +10,7 @@ use log::warn;
 use rtrb::RingBuffer;
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{Dialect, Mcu};
+use pinion_firmware::mcu::{Dialect, EdgeRecorder, Mcu};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_sync::progress::Progress;
@@ -33,6 +33,8 @@ pub(crate) const REQUESTS: usize = 256;
 /// Everything that the core's thread needs.
 pub(crate) struct CoreThread {
     pub(crate) board: Box<dyn Board>,
+    /// Set if the edges of outputs are recorded.
+    pub(crate) edges: Option<Arc<dyn EdgeRecorder>>,
     pub(crate) timing: Timing,
     /// The dialect that the MCU speaks before a host comes.
     pub(crate) dialect: Arc<Dialect>,
@@ -58,6 +60,7 @@ impl CoreThread {
         let core = started(thread::Builder::new().name("core".into()).spawn(move || {
             let CoreThread {
                 board,
+                edges,
                 timing,
                 dialect,
                 wake,
@@ -84,7 +87,8 @@ impl CoreThread {
             });
             let clock = timing.clock.clone();
             let workers = Threads::new(thread::current(), prepare, clock.clone(), heartbeat, recording, may_poll);
-            let mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(response_ring));
+            let mut mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(response_ring));
+            edges.into_iter().for_each(|edges| mcu.record_edges(edges));
             let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
             let (requests, progress) = (inbox, core_progress);
             Core::new(Parts {

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Workers: each bus has a thread that runs the errands to the bus's devices, one after the other. So the core never
+//! Workers: each bus has a thread that runs the jobs to the bus's devices, one after the other. So the core never
 //! waits for a device.
 
 #![forbid(unsafe_code)]
 
+use std::any::Any;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle, Thread};
@@ -12,7 +13,7 @@ use std::time::Duration;
 use log::error;
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
-use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
+use pinion_firmware::mcu::{Devices, Finished, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -25,7 +26,7 @@ use crate::core::busy_poll::PollBudget;
 use crate::core::heartbeat::{Heartbeat, JobClock};
 use crate::recorder::{Recording, span};
 
-/// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
+/// Highest number of jobs that may wait for one bus. There are at most 256 objects, with one or two jobs each.
 const QUEUE_JOBS: usize = 1024;
 /// How long a worker polls for the next job after a job that a command waited for. The core runs the next command
 /// within microseconds, if the host has sent it already.
@@ -35,13 +36,21 @@ const END_LIMIT: Duration = Duration::from_secs(2);
 
 struct Worker {
     bus: String,
-    /// The jobs, and when they were submitted.
-    jobs: Producer<(Job, Clock)>,
-    done: Consumer<Completion>,
+    jobs: Producer<Message>,
+    devices: usize,
+    done: Consumer<Finished>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
     /// Nobody waits for its end.
     left_behind: bool,
+}
+
+/// To a worker.
+enum Message {
+    /// A device that it owns from now on.
+    Device(Box<dyn Any + Send>),
+    /// A job, and when it was submitted.
+    Job(SentJob, Clock),
 }
 
 /// The thread of each new worker calls this first.
@@ -59,8 +68,8 @@ pub(crate) struct Threads {
 }
 
 impl Threads {
-    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `heartbeat` since when it runs the
-    /// errand. It records its errands in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
+    /// No workers yet. A worker unparks `core` when a job is done, and notes in `heartbeat` since when it runs the
+    /// job. It records its jobs in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(crate) fn new(
         core: Thread,
         prepare: Prepare,
@@ -82,8 +91,17 @@ impl Threads {
         let clock = self.clock.clone();
         let polling = PollBudget::new(self.may_poll, clock.now());
         let trace_writer = self.recording.worker(bus);
-        let server =
-            Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, polling, trace_writer };
+        let server = Server {
+            jobs: inbox,
+            devices: Devices::default(),
+            done: outbox,
+            quit: quit.clone(),
+            core,
+            clock,
+            shown,
+            polling,
+            trace_writer,
+        };
         let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
@@ -95,7 +113,7 @@ impl Threads {
                 let trouble = Trouble::new(format!("its thread cannot be started ({error})"));
                 overflow(bus, trouble.remedy("raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })
+        Ok(Worker { bus: bus.into(), jobs, devices: 0, done, quit, thread, left_behind: false })
     }
 }
 
@@ -106,6 +124,10 @@ fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
     Shutdown::because(reason::WORKER_OVERFLOW, why.into().of(format_args!("the worker of {bus}")))
 }
 
+fn no_worker() -> Shutdown {
+    overflow("a bus", Trouble::new("it is not there").remedy(REPORT))
+}
+
 impl Workers for Threads {
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         if let Some(worker) = self.workers.iter().position(|worker| worker.bus == bus) {
@@ -113,6 +135,14 @@ impl Workers for Threads {
         }
         self.workers.push(self.spawn(bus)?);
         Ok(WorkerId(self.workers.len() - 1))
+    }
+
+    fn give(&mut self, WorkerId(worker): WorkerId, device: Box<dyn Any + Send>) -> Result<usize, Shutdown> {
+        let worker = self.workers.get_mut(worker).ok_or_else(no_worker)?;
+        worker.jobs.push(Message::Device(device)).map_err(|_| overflow(&worker.bus, "it has too many devices"))?;
+        worker.thread.thread().unpark();
+        worker.devices += 1;
+        Ok(worker.devices - 1)
     }
 
     fn are_parallel(&self) -> bool {
@@ -125,21 +155,20 @@ impl Workers for Threads {
         }
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         let Some(worker) = self.workers.get_mut(worker) else {
-            let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
-            return Err(Refused { job, why });
+            return Err((job, no_worker()));
         };
-        if let Err(PushError::Full((job, _))) = worker.jobs.push((job, self.clock.now())) {
+        if let Err(PushError::Full(Message::Job(job, _))) = worker.jobs.push(Message::Job(job, self.clock.now())) {
             let trouble = Trouble::new("more is asked of it at once than there are devices");
             let why = overflow(&worker.bus, trouble.remedy(REPORT));
-            return Err(Refused { job, why });
+            return Err((job, why));
         }
         worker.thread.thread().unpark();
         Ok(())
     }
 
-    fn completion(&mut self) -> Option<Completion> {
+    fn completion(&mut self) -> Option<Finished> {
         self.workers.iter_mut().find_map(|worker| worker.done.pop().ok())
     }
 
@@ -147,7 +176,7 @@ impl Workers for Threads {
         self.workers.iter().any(|worker| !worker.done.is_empty())
     }
 
-    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
+    fn report(&self, each: &mut dyn FnMut(&str, usize)) {
         self.workers.iter().for_each(|worker| each(&worker.bus, QUEUE_JOBS - worker.jobs.slots()));
     }
 
@@ -180,8 +209,9 @@ impl Drop for Threads {
 
 /// A worker's thread.
 struct Server {
-    jobs: Consumer<(Job, Clock)>,
-    done: Producer<Completion>,
+    jobs: Consumer<Message>,
+    devices: Devices,
+    done: Producer<Finished>,
     quit: Arc<AtomicBool>,
     core: Thread,
     clock: Arc<dyn TimeSource>,
@@ -201,7 +231,8 @@ impl Server {
                 return;
             }
             match self.jobs.pop() {
-                Ok((job, submitted)) => self.serve(job, submitted),
+                Ok(Message::Device(device)) => self.devices.add(device),
+                Ok(Message::Job(job, submitted)) => self.serve(job, submitted),
                 Err(_) if ending => return,
                 Err(_) if self.polling.goes_on(self.clock.now()) => thread::yield_now(),
                 Err(_) => thread::park(),
@@ -209,19 +240,18 @@ impl Server {
         }
     }
 
-    fn serve(&mut self, job: Job, submitted: Clock) {
-        let Job { oid, mut parcel, holds } = job;
+    fn serve(&mut self, mut job: SentJob, submitted: Clock) {
         self.shown.begin();
         let began = self.clock.now();
-        let number = oid.number();
+        let (number, holds) = (job.oid().number(), job.holds());
         self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
-        let ended = self.clock.errand(&mut || parcel.run());
+        let ended = self.clock.run_job(&mut || job.run(&mut self.devices));
         self.shown.end();
         self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
-        // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
-        let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
+        // This does not fail: there are no more jobs under way than boxes, and both queues have the same length.
+        let _ = self.done.push(Finished { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
-        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds)) {
+        if !(holds && self.jobs.peek().is_ok_and(|next| matches!(next, Message::Job(next, _) if next.holds()))) {
             self.core.unpark();
         }
         // Samples, which timers ask for, come at their own pace.
@@ -240,7 +270,7 @@ impl Server {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::mcu::{Oid, Parcel};
+    use pinion_firmware::mcu::{AnyJob, Oid};
     use pinion_linux::clock::Monotonic;
     use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
@@ -252,8 +282,8 @@ mod tests {
         said: Sender<u8>,
     }
 
-    impl Parcel for Slow {
-        fn run(&mut self) {
+    impl AnyJob for Slow {
+        fn run(&mut self, _devices: &mut Devices) {
             let _ = self.go_on.lock().unwrap().recv();
             let _ = self.said.send(self.number);
         }
@@ -279,12 +309,12 @@ mod tests {
 
     struct Quick;
 
-    impl Parcel for Quick {
-        fn run(&mut self) {}
+    impl AnyJob for Quick {
+        fn run(&mut self, _devices: &mut Devices) {}
     }
 
-    fn submit(threads: &mut Threads, worker: WorkerId, parcel: Box<dyn Parcel>, holds: bool) {
-        let taken = threads.submit(worker, Job { oid: Oid::new(0), parcel, holds });
+    fn submit(threads: &mut Threads, worker: WorkerId, job: Box<dyn AnyJob>, holds: bool) {
+        let taken = threads.submit(worker, SentJob::new(Oid::new(0), 0, job, holds));
         assert!(taken.is_ok());
     }
 
@@ -322,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
+    fn a_worker_polls_for_the_next_job_of_a_command_only() {
         // One look when the job is submitted, one when it begins, one when it ends, and one before the worker sleeps.
         assert_eq!(looks_after_a_job(false, true), 4);
         assert_eq!(looks_after_a_job(true, false), 4);
@@ -372,7 +402,7 @@ mod tests {
         // Another one takes its place.
         threads.start("i2c1").unwrap();
         drop(release);
-        // This ends when both errands are dropped. The second one is not begun.
+        // This ends when both jobs are dropped. The second one is not begun.
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
     }
 

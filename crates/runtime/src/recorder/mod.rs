@@ -29,8 +29,7 @@ use nix::sys::utsname::uname;
 use nix::unistd::{Pid, gettid};
 use rtrb::{Consumer, RingBuffer};
 
-use pinion_firmware::board::Board;
-use pinion_firmware::mcu::Dialect;
+use pinion_firmware::mcu::{Dialect, EdgeRecorder};
 use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -50,7 +49,7 @@ use crate::status::{ClientLimits, Place, serve_on};
 use crate::transport::LinkName;
 
 use computer::Computer;
-use edges::{EdgeBoard, EdgeWriter};
+use edges::EdgeWriter;
 use memory::Memory;
 use pace::Pace;
 use trace_writer::News;
@@ -296,11 +295,10 @@ impl Recorder {
         }
     }
 
-    /// The same board, which also records the edges of its outputs.
-    pub(super) fn with_edges(&self, board: Box<dyn Board>) -> Box<dyn Board> {
-        let Some(writer) = self.recording.memory.edges() else { return board };
-        let trace_writer = Arc::new(EdgeWriter { writer: Mutex::new(writer), clock: self.recording.clock });
-        Box::new(EdgeBoard { board, trace_writer, names: self.names.clone() })
+    /// Records the edges of outputs.
+    pub(super) fn edges(&self) -> Option<Arc<dyn EdgeRecorder>> {
+        let writer = Mutex::new(self.recording.memory.edges()?);
+        Some(Arc::new(EdgeWriter { writer, clock: self.recording.clock, names: self.names.clone() }))
     }
 
     /// The link's writer.

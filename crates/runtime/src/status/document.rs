@@ -157,7 +157,7 @@ fn mcu(Answer { mcu, waiting, margin }: &Answer, facts: &Facts) -> McuStatus {
     let (queued, room) = mcu.moves;
     McuStatus {
         shutdown,
-        owes: (!mcu.debtor.is_empty()).then(|| mcu.debtor.clone()),
+        owes: (!mcu.pending.is_empty()).then(|| mcu.pending.clone()),
         dialect: mcu.dialect.map(|dialect| dialect.to_string()),
         lines: mcu.lines.iter().map(|state| line(state, &facts.pins)).collect(),
         objects: mcu.objects.iter().map(|state| object(state, &facts.pins)).collect(),

@@ -76,7 +76,7 @@ impl SnapshotWriter {
     #[cold]
     pub(super) fn tell(&mut self, mcu: &Mcu, waiting: usize, margin: Ticks) {
         let Some(mut answer) = self.at_work.take().or_else(|| self.asked.pop().ok()) else { return };
-        if mcu.tell(&mut answer.mcu) {
+        if mcu.fill(&mut answer.mcu) {
             (answer.waiting, answer.margin) = (waiting, margin);
             // There is room: at most one answer is under way.
             let _ = self.told.push(answer);

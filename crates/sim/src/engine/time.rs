@@ -20,16 +20,16 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
 /// the guardian ends the program.
 pub(crate) const LATE_LIMIT: Ticks = Ticks::from_ms(400);
 
-/// How far an errand may be ahead of the clock.
+/// How far a job may be ahead of the clock.
 const AHEAD: Ticks = Ticks::from_ms(1);
 
 thread_local! {
-    /// The instant of the errand that this thread runs; `None` if it runs no errand.
-    static ERRAND: Cell<Option<Clock>> = const { Cell::new(None) };
+    /// The instant of the job that this thread runs; `None` if it runs no job.
+    static JOB: Cell<Option<Clock>> = const { Cell::new(None) };
 }
 
-/// The printer's time. While the core runs a timer, it is the timer's due time. While a worker runs an errand, it is
-/// the instant that the errand waited for. Otherwise it is the clock.
+/// The printer's time. While the core runs a timer, it is the timer's due time. While a worker runs a job, it is
+/// the instant that the job waited for. Otherwise it is the clock.
 ///
 /// So an edge happens at its due time, however late the computer is. Most computers that try the printer have no real
 /// time. Their parts would misread everything that is timed by microseconds: the bits of a UART, the pulses of a servo,
@@ -49,9 +49,9 @@ impl PrinterTime {
         self.due.clone()
     }
 
-    /// The instant of this thread's access to a line. Workers use lines in errands only.
+    /// The instant of this thread's access to a line. Workers use lines in jobs only.
     pub(crate) fn of_the_caller(&self) -> Clock {
-        ERRAND.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now())
+        JOB.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now())
     }
 
     fn sleep_until(&self, end: Clock) {
@@ -60,10 +60,10 @@ impl PrinterTime {
     }
 }
 
-/// The time of an errand advances only in its waits, so no bit is longer than intended.
+/// The time of a job advances only in its waits, so no bit is longer than intended.
 impl TimeSource for PrinterTime {
     fn now(&self) -> Clock {
-        ERRAND.get().unwrap_or_else(|| self.clock.now())
+        JOB.get().unwrap_or_else(|| self.clock.now())
     }
 
     fn instant_of(&self, monotonic: Duration) -> Clock {
@@ -74,21 +74,21 @@ impl TimeSource for PrinterTime {
         self.clock.duration_of(clock)
     }
 
-    /// Nothing has to spin, because the lines use the errand's time and not the clock. The time between two bits is too
+    /// Nothing has to spin, because the lines use the job's time and not the clock. The time between two bits is too
     /// short for a sleep. After about a thousand bits a sleep is possible.
     fn spin_until(&self, end: Clock) {
-        let Some(now) = ERRAND.get() else { return self.clock.spin_until(end) };
-        ERRAND.set(Some(now.max(end)));
+        let Some(now) = JOB.get() else { return self.clock.spin_until(end) };
+        JOB.set(Some(now.max(end)));
         if end.since(self.clock.now()) > i64::from(AHEAD.0) {
             self.sleep_until(end);
         }
     }
 
-    /// The errand ends when both its own time and the clock have reached its end.
-    fn errand(&self, work: &mut dyn FnMut()) -> Clock {
-        ERRAND.set(Some(self.clock.now()));
+    /// The job ends when both its own time and the clock have reached its end.
+    fn run_job(&self, work: &mut dyn FnMut()) -> Clock {
+        JOB.set(Some(self.clock.now()));
         work();
-        if let Some(end) = ERRAND.take() {
+        if let Some(end) = JOB.take() {
             self.sleep_until(end);
         }
         self.clock.now()
@@ -101,10 +101,10 @@ mod tests {
     use pinion_firmware::time::{NS_PER_TICK, VirtualClock};
 
     #[test]
-    fn an_errand_does_not_feel_how_late_the_computer_is() {
+    fn a_job_does_not_feel_how_late_the_computer_is() {
         let clock = VirtualClock::at(Clock::EPOCH);
         let time = PrinterTime::new(Arc::new(clock.clone()));
-        let ended = time.errand(&mut || {
+        let ended = time.run_job(&mut || {
             for bit in 1..4 {
                 // Each wait ends much too late.
                 clock.set(Clock::EPOCH + Ticks(1000 * bit));
@@ -135,11 +135,11 @@ mod tests {
     }
 
     #[test]
-    fn an_errand_takes_its_time() {
+    fn a_job_takes_its_time() {
         let clock = Arc::new(Going(std::time::Instant::now()));
         let time = PrinterTime::new(clock.clone());
         let mut end = Clock::EPOCH;
-        let ended = time.errand(&mut || {
+        let ended = time.run_job(&mut || {
             end = time.now() + Ticks::from_us(5500);
             while time.now() < end {
                 time.spin_until(time.now() + Ticks::from_us(25));
@@ -157,7 +157,7 @@ mod tests {
         time.due().set(Some(Clock::from_ticks(1_000)));
         let worker = std::thread::spawn({
             let time = time.clone();
-            move || time.errand(&mut || assert_eq!(time.of_the_caller(), now))
+            move || time.run_job(&mut || assert_eq!(time.of_the_caller(), now))
         });
         assert_eq!(worker.join().ok(), Some(now));
         assert_eq!(time.of_the_caller(), Clock::from_ticks(1_000));

@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, Next, Object, Oid, OutputLine, Response, Safe, Timer, Turn, WireClock, command, response,
+    Command, Context, Feature, Next, Object, Oid, OutputLine, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -35,24 +35,24 @@ struct Bell {
     struck: bool,
 }
 
-const CONFIG_BELL: Command = command!("config_bell oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
-    mcu.vacant(oid)?;
-    let line = mcu.output(pin, false, false)?;
-    mcu.assign_on(pin, oid, Bell { line, swinging: false, struck: false })
+const CONFIG_BELL: Command = command!("config_bell oid=%c pin=%u", |context, oid: Oid, pin: Pin| {
+    context.vacant(oid)?;
+    let line = context.output(pin, false, false)?;
+    context.assign_on(pin, oid, Bell { line, swinging: false, struck: false })
 });
 
-const RING_BELL: Command = command!("ring_bell oid=%c clock=%u", Bell, |bell, turn, clock: WireClock| {
-    let at = turn.instant(clock);
-    bell.ring(turn, at)
+const RING_BELL: Command = command!("ring_bell oid=%c clock=%u", Bell, |bell, context, clock: WireClock| {
+    let at = context.instant(clock);
+    bell.ring(context, at)
 });
 
 impl Bell {
-    fn ring(&mut self, turn: &mut Turn, at: Clock) -> Result<(), Shutdown> {
+    fn ring(&mut self, context: &mut Context, at: Clock) -> Result<(), Shutdown> {
         if self.swinging {
             return Err(Shutdown::by_host(STILL_SWINGING, "ring_bell came too soon"));
         }
         self.swinging = true;
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     }
 }
 
@@ -61,27 +61,19 @@ impl Object for Bell {
         KIND
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle(turn)?;
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         self.struck = !self.struck;
+        self.line.write(context, self.struck)?;
         if self.struck {
-            turn.send(Rung { oid: turn.oid(), clock: at });
+            context.send(Rung { oid: context.oid(), clock: at });
             return Ok(Next::At(at + STRIKE));
         }
         self.swinging = false;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        self.line.settle(turn, KIND, done)
-    }
-
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.swinging = false;
         self.struck = false;
-    }
-
-    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.line.make_safe(turn, false)
     }
 }

@@ -3,10 +3,10 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{BusDevice, BusError};
+use crate::board::BusError;
 use crate::feature::spi::{Spi, spi_shutdown};
 use crate::mcu::{
-    Back, Command, Conversation, Done, Feature, Next, Object, Oid, Response, Slot, Talk, Timer, Turn, WireClock,
+    Back, Chip, Command, Context, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock,
     command, response,
 };
 use crate::shutdown::Shutdown;
@@ -33,11 +33,13 @@ const READ: u8 = 0x80;
 
 struct Listen;
 
-impl Talk for Listen {
+impl Job for Listen {
+    type Device = Chip;
     /// The loudness.
-    type Answer = u8;
+    type Out = u8;
+    type Failure = BusError;
 
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<u8, BusError> {
+    fn run(&mut self, chip: &mut Chip) -> Result<u8, BusError> {
         let mut message = [READ | Register::Loudness as u8, 0];
         chip.exchange(&mut message)?;
         Ok(message[1])
@@ -46,25 +48,25 @@ impl Talk for Listen {
 
 struct Ear {
     spi: Oid,
-    listen: Slot<Conversation<Listen>>,
+    listen: JobSlot<Listen>,
     rest_ticks: Ticks,
 }
 
-const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
-    mcu.require::<Spi>(spi_oid)?;
-    mcu.assign(oid, Ear { spi: spi_oid, listen: Slot::talking(Listen), rest_ticks: Ticks(0) })
+const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |context, oid: Oid, spi_oid: Oid| {
+    context.require::<Spi>(spi_oid)?;
+    context.assign(oid, Ear { spi: spi_oid, listen: JobSlot::new(Listen), rest_ticks: Ticks(0) })
 });
 
 const QUERY_EAR: Command =
-    command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, turn, clock: WireClock, rest_ticks: Ticks| {
-        let at = turn.instant(clock);
-        turn.cancel(TIMER);
+    command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, context, clock: WireClock, rest_ticks: Ticks| {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
         ear.listen.drop_pending();
         ear.rest_ticks = rest_ticks;
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
-        turn.schedule(TIMER, at)
+        context.schedule(TIMER, at)
     });
 
 impl Object for Ear {
@@ -72,23 +74,23 @@ impl Object for Ear {
         "ear"
     }
 
-    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if self.listen.is_here() {
-            self.listen.converse(turn, self.spi)?;
+            self.listen.send_to(context, self.spi)?;
         }
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, counts: true, .. }) = self.listen.back(done) else { return Ok(()) };
+    fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
+        let Some(Back { result, is_wanted: true, .. }) = self.listen.back(finished) else { return Ok(()) };
         match result {
-            Ok(loudness) => turn.send(Heard { oid: turn.oid(), loudness }),
-            Err(error) => return turn.try_shut_down(spi_shutdown(error.clone())),
+            Ok(loudness) => context.send(Heard { oid: context.oid(), loudness }),
+            Err(error) => return context.try_shut_down(spi_shutdown(error.clone())),
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _turn: &mut Turn) {
+    fn shutdown(&mut self, _context: &mut Context) {
         self.listen.drop_pending();
     }
 }

@@ -11,18 +11,16 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-use log::warn;
 use pinion_sync::watch::Watch;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::between_ticks;
-use crate::mcu::{Errand, Mcu};
+use crate::mcu::{Context, DeviceWarning, Job};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
-use super::Shifted;
+use super::{SUBJECT, Shifted};
 
 /// Shortest time that the clock is high, and low: 200 ns (T3 and T4 of the data sheet).
 const PULSE_NS: u32 = 200;
@@ -50,13 +48,15 @@ pub(super) struct Shift {
     announced: u32,
     /// The clock line's name in the log.
     name: String,
-    /// Whether the log already has a line about a clock that was high for too long.
-    told: bool,
+    /// Whether there was a warning about a clock that was high for too long.
+    has_warned: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Shift {
     pub(super) fn new(
-        mcu: &Mcu,
+        context: &Context,
         sclk_pin: Pin,
         sclk: Arc<dyn Line>,
         dout: Arc<dyn Line>,
@@ -64,7 +64,22 @@ impl Shift {
         watcher: Option<&Watcher>,
     ) -> Shift {
         let watch = watcher.map(|watcher| watcher.watch.clone());
-        Shift { sclk, dout, pulses, time: mcu.clock(), watch, announced: 0, name: mcu.name(sclk_pin), told: false }
+        Shift {
+            sclk,
+            dout,
+            pulses,
+            time: context.clock(),
+            watch,
+            announced: 0,
+            name: context.name(sclk_pin),
+            has_warned: false,
+            warning: None,
+        }
+    }
+
+    /// Sets the clock line while no sample is shifted out.
+    pub(super) fn power_down(&self, down: bool) -> Result<(), Shutdown> {
+        self.sclk.write(down)
     }
 
     pub(super) fn run(&mut self) -> Result<Shifted, Shutdown> {
@@ -85,9 +100,9 @@ impl Shift {
         let (raw, longest) = shifted?;
         let Some(longest) = longest else { return Ok(Shifted { raw, too_long: true }) };
         let too_long = longest > i64::from(self.time.at_most(POWER_DOWN_NS).0);
-        if too_long && !self.told {
-            self.told = true;
-            warn!("{}", too_slow(&self.name, longest));
+        if too_long && !self.has_warned {
+            self.has_warned = true;
+            self.warning = Some(DeviceWarning::new(SUBJECT, too_slow(&self.name, longest)));
         }
         Ok(Shifted { raw, too_long })
     }
@@ -116,12 +131,9 @@ impl Shift {
         Ok((raw, Some(longest)))
     }
 
-    /// Waits for the rest of a pulse, on the computer's clock. It may show a span that is too long by one of its steps.
+    /// Waits for the rest of a pulse.
     fn wait(&self) {
-        let (start, pulse) = (Instant::now(), Duration::from_nanos((PULSE_NS + self.time.step_ns()).into()));
-        while start.elapsed() < pulse {
-            std::hint::spin_loop();
-        }
+        self.time.spin_until(self.time.now() + self.time.at_least(PULSE_NS));
     }
 
     /// Announces the next pulse to the second worker. Returns when it watches this pulse, and for how many ticks the clock
@@ -144,7 +156,7 @@ impl Shift {
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
-        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
+        "{SUBJECT} ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
     )
 }
 
@@ -156,15 +168,25 @@ pub(super) struct Watcher {
 }
 
 impl Watcher {
-    pub(super) fn new(mcu: &Mcu, sclk: Arc<dyn Line>) -> Watcher {
-        Watcher { sclk, time: mcu.clock(), watch: Arc::default() }
+    pub(super) fn new(context: &Context, sclk: Arc<dyn Line>) -> Watcher {
+        Watcher { sclk, time: context.clock(), watch: Arc::default() }
     }
 }
 
-impl Errand for Watcher {
-    type Answer = ();
+/// Lets the watcher watch a reading.
+pub(super) struct WatchReading;
+
+impl Job for WatchReading {
+    type Device = Watcher;
+    type Out = ();
     type Failure = Shutdown;
 
+    fn run(&mut self, watcher: &mut Watcher) -> Result<(), Shutdown> {
+        watcher.run()
+    }
+}
+
+impl Watcher {
     fn run(&mut self) -> Result<(), Shutdown> {
         // The pulse that is watched, and since when.
         let (mut pulse, mut since) = (0, self.time.now());
@@ -218,6 +240,7 @@ mod tests {
     use std::sync::Mutex;
     use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
     use std::thread;
+    use std::time::{Duration, Instant};
 
     /// A clock that is this many times slower than that of the computer. So other programs disturb the workers less.
     struct Slow(Instant, u32);
@@ -304,7 +327,8 @@ mod tests {
             watch: Some(watcher.watch.clone()),
             announced: u32::MAX - 5,
             name: "gpio11".into(),
-            told: false,
+            has_warned: false,
+            warning: None,
         };
         (shift, watcher, chip)
     }

@@ -19,18 +19,14 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex, PoisonError};
-
-use log::warn;
-
-use crate::board::{BusDevice, BusError};
+use crate::board::BusDevice;
 use crate::feature::spi::spi_shutdown;
 use crate::shutdown::Shutdown;
 
-use super::Shifted;
+use crate::mcu::DeviceWarning;
+use crate::trouble::Trouble;
 
-/// The controller. Reading and power-down run on its worker, one after the other. So the lock is always free.
-pub(super) type Shared = Arc<Mutex<Box<dyn BusDevice>>>;
+use super::{SUBJECT, Shifted};
 
 /// Bits per second.
 pub(super) const RATE_HZ: u32 = 500_000;
@@ -46,55 +42,55 @@ const LOOKS_MAX: u32 = 100;
 
 /// Reads samples.
 pub(super) struct Waves {
-    device: Shared,
+    device: Box<dyn BusDevice>,
     /// Pulses of a sample, and for gain and channel.
     pulses: u8,
     /// The clock's name in the log.
     name: String,
     /// Looks since the last sample.
     looks: u32,
-    /// Whether the log already has a line about a chip without samples.
-    told: bool,
+    /// Whether there was a warning about a chip without samples.
+    has_warned: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Waves {
-    pub(super) fn new(device: Shared, pulses: u8, name: String) -> Waves {
-        Waves { device, pulses, name, looks: 0, told: false }
+    pub(super) fn new(device: Box<dyn BusDevice>, pulses: u8, name: String) -> Waves {
+        Waves { device, pulses, name, looks: 0, has_warned: false, warning: None }
     }
 
     /// Reads a sample, if one is ready.
     pub(super) fn run(&mut self) -> Result<Option<Shifted>, Shutdown> {
         let mut look = [0];
-        exchange(&self.device, &mut look)?;
+        self.exchange(&mut look)?;
         // The last bit is the newest.
         if look[0] & 1 != 0 {
             self.looks = self.looks.saturating_add(1);
-            if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.told, true) {
-                warn!(
-                    "HX71x sclk ({}): the chip has no sample: check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once",
-                    self.name
-                );
+            if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.has_warned, true) {
+                let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once");
+                let trouble = trouble.of(format_args!("{} ({})", SUBJECT, self.name));
+                self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
             }
             return Ok(None);
         }
         self.looks = 0;
         let mut wave = wave(self.pulses);
-        exchange(&self.device, &mut wave)?;
+        self.exchange(&mut wave)?;
         // Zeros are a wrong end of a sample.
         Ok(Some(Shifted { raw: bits(&wave, self.pulses).unwrap_or(0), too_long: false }))
     }
-}
 
-/// Switches the chip off or starts it again.
-pub(super) fn power_down(device: &Shared, down: bool) -> Result<(), Shutdown> {
-    let mut bytes = [0xff; HIGH_BYTES + 1];
-    bytes[HIGH_BYTES] = 0;
-    exchange(device, if down { &mut bytes[..HIGH_BYTES] } else { &mut bytes })
-}
+    /// Switches the chip off or starts it again.
+    pub(super) fn power_down(&mut self, down: bool) -> Result<(), Shutdown> {
+        let mut bytes = [0xff; HIGH_BYTES + 1];
+        bytes[HIGH_BYTES] = 0;
+        self.exchange(if down { &mut bytes[..HIGH_BYTES] } else { &mut bytes })
+    }
 
-fn exchange(device: &Shared, bytes: &mut [u8]) -> Result<(), Shutdown> {
-    let exchanged = device.lock().unwrap_or_else(PoisonError::into_inner).exchange(bytes);
-    exchanged.map_err(|error: BusError| spi_shutdown(error))
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), Shutdown> {
+        self.device.exchange(bytes).map_err(spi_shutdown)
+    }
 }
 
 /// The bytes of this many pulses. The rest is low.

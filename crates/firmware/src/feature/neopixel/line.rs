@@ -15,11 +15,10 @@
 
 use std::sync::Arc;
 
-use log::warn;
-
 use crate::board::{Line, Pin};
 use crate::feature::pace::Pace;
-use crate::mcu::Mcu;
+use crate::mcu::Context;
+use crate::mcu::DeviceWarning;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
@@ -71,6 +70,9 @@ impl Limits {
     }
 }
 
+/// The first words of the warning.
+const WARNING: &str = "LEDs at";
+
 /// Sends frames.
 pub(super) struct Pulses {
     line: Arc<dyn Line>,
@@ -82,8 +84,10 @@ pub(super) struct Pulses {
     free_at: Clock,
     /// The line's name in the log.
     name: String,
-    /// Whether the log already has a line about frames that missed their times.
-    told: bool,
+    /// Whether there was a warning about frames that missed their times.
+    has_warned: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Pulses {
@@ -91,14 +95,14 @@ impl Pulses {
     ///
     /// "Not an output pin" if the line has no registers or the clock is too coarse, "Invalid neopixel data_size".
     pub(super) fn new(
-        mcu: &Mcu,
+        context: &Context,
         pin: Pin,
         line: Arc<dyn Line>,
         size: usize,
         bit_max: Ticks,
         reset: Ticks,
     ) -> Result<Pulses, Shutdown> {
-        let name = mcu.name(pin);
+        let name = context.name(pin);
         let refused = |why: &str, or: &str| {
             let cause = format!("{name} cannot drive LEDs: {why}");
             Shutdown::because(reason::NOT_OUTPUT, cause).remedy(format!("{TO_SPI}{or}"))
@@ -111,7 +115,7 @@ impl Pulses {
             let why = "their pulses are too short for a program on Linux";
             return Err(refused(why, OR_TO_FAST_LINE));
         }
-        let clock = mcu.clock();
+        let clock = context.clock();
         let Some(limits) = Limits::of(&*clock, bit_max) else {
             let why = format!("the computer's clock has steps of {} ns, too long for their pulses", clock.step_ns());
             return Err(refused(&why, ""));
@@ -120,9 +124,9 @@ impl Pulses {
             let cause = format!("a chain of {size} bytes is too long for a line, which takes {SIZE_MAX}");
             return Err(Shutdown::because(INVALID_SIZE, cause).remedy("lower chain_count").of(&name));
         }
-        let pace = Pace::new(mcu);
+        let pace = Pace::new(context);
         let free_at = pace.now() + reset;
-        Ok(Pulses { line, pace, limits, reset, free_at, name, told: false })
+        Ok(Pulses { line, pace, limits, reset, free_at, name, has_warned: false, warning: None })
     }
 
     /// Sends the colors. False if no try had its times.
@@ -138,11 +142,12 @@ impl Pulses {
                 return Ok(true);
             }
         }
-        if !std::mem::replace(&mut self.told, true) {
-            warn!(
-                "LEDs at {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
+        if !std::mem::replace(&mut self.has_warned, true) {
+            let text = format!(
+                "{WARNING} {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
                 self.name
             );
+            self.warning = Some(DeviceWarning::new(WARNING, text));
         }
         Ok(false)
     }
@@ -270,7 +275,8 @@ mod tests {
             reset: Ticks::from_us(300),
             free_at: Clock::EPOCH,
             name: "gpio18".into(),
-            told: false,
+            has_warned: false,
+            warning: None,
         };
         (wire, pulses)
     }
@@ -379,7 +385,7 @@ mod tests {
         let (wire, mut pulses) = pulses((0..200).map(|edge| (edge, When::After, 100)).collect());
         assert_eq!(pulses.send(&[0; 3]), Ok(false));
         assert_eq!(wire.edges.lock().unwrap().len(), 2 * TRIES as usize, "each is broken off after one pulse");
-        assert!(pulses.told);
+        assert!(pulses.has_warned);
         wire.late.lock().unwrap().clear();
         assert_eq!(pulses.send(&[0; 3]), Ok(true));
     }

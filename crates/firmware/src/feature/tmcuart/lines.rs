@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A TMC UART on GPIO lines, bit by bit.
 //!
-//! The firmware has a timer for each bit. Here an errand times a whole message on a worker. At 40 kbaud a message is up
+//! The firmware has a timer for each bit. Here a job times a whole message on a worker. At 40 kbaud a message is up
 //! to 5 ms of edges 25 us apart, which would keep the core awake. `benches/bits.rs` measures how late bits are
 //! in both cases (docs/develop/performance.md).
 //!
@@ -42,12 +42,28 @@ const SYNC_MASK: u8 = 0b11_1111;
 /// The bits between the first and the last falling edge of these.
 const SYNC_BITS: usize = 4;
 
-/// The two ends of the UART, and the time of its bits.
-pub(super) struct Lines {
+/// The sending end of the UART.
+#[derive(Clone)]
+pub(super) struct Wire {
     pub(super) tx: Arc<dyn Line>,
-    pub(super) rx: Arc<dyn Line>,
     /// The resistor of a single wire while it listens. `None`: there are two wires.
     pub(super) single: Option<Bias>,
+}
+
+impl Wire {
+    /// Drives the line high, its level between messages.
+    pub(super) fn idle(&self) -> Result<(), Shutdown> {
+        match self.single {
+            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_value: true }),
+            None => self.tx.write(true),
+        }
+    }
+}
+
+/// The two ends of the UART, and the time of its bits.
+pub(super) struct Lines {
+    pub(super) wire: Wire,
+    pub(super) rx: Arc<dyn Line>,
     pub(super) pace: Pace,
     /// The configured length of a bit.
     pub(super) bit: Ticks,
@@ -66,22 +82,14 @@ enum Sent {
 }
 
 impl Lines {
-    /// Drives the line high, its level between messages.
-    pub(super) fn idle(&self) -> Result<(), Shutdown> {
-        match self.single {
-            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_value: true }),
-            None => self.tx.write(true),
-        }
-    }
-
     fn listen(&self) -> Result<(), Shutdown> {
-        self.single.map_or(Ok(()), |bias| self.rx.turn(Direction::Input(bias)))
+        self.wire.single.map_or(Ok(()), |bias| self.rx.turn(Direction::Input(bias)))
     }
 
     /// Sends a message, receives its reply, and leaves the line idle.
     pub(super) fn exchange(&mut self, message: &mut Message) -> Result<(), Shutdown> {
         let exchanged = self.converse(message);
-        exchanged.and(self.idle())
+        exchanged.and(self.wire.idle())
     }
 
     fn converse(&mut self, message: &mut Message) -> Result<(), Shutdown> {
@@ -89,7 +97,7 @@ impl Lines {
             self.spoilt = false;
             self.pace.until_between_ticks(bits(self.bit, message.bits_max()));
             // The first call is slower than the others. Without this one, the first bit would be longer.
-            self.tx.write(true)?;
+            self.wire.tx.write(true)?;
             let pause = match self.send(message.bits(), self.pace.now())? {
                 Sent::All { .. } if message.read_len == 0 => break,
                 Sent::All { end, bit } => {
@@ -99,7 +107,7 @@ impl Lines {
                     if !self.spoilt {
                         break;
                     }
-                    self.idle()?;
+                    self.wire.idle()?;
                     QUIET
                 }
                 Sent::Part => bits(self.bit, RECOVERY_BITS),
@@ -127,7 +135,7 @@ impl Lines {
                     return Ok(Sent::Stopped);
                 }
                 let begins = self.pace.now();
-                self.tx.write(level)?;
+                self.wire.tx.write(level)?;
                 line = level;
                 let ended = self.pace.now();
                 if place % FRAME_BITS == 0 {
@@ -173,12 +181,12 @@ impl Lines {
             if place + ahead + 1 >= places || !self.pace.until(begins) {
                 return Ok(false);
             }
-            self.tx.write(!bit_of(data, place + ahead))?;
+            self.wire.tx.write(!bit_of(data, place + ahead))?;
             if self.pace.now().since(begins) > i64::from(bit.0 / 4) || !self.pace.until(begins + bit) {
                 return Ok(false);
             }
         }
-        self.tx.write(true)?;
+        self.wire.tx.write(true)?;
         Ok(true)
     }
 
@@ -322,8 +330,13 @@ mod tests {
             reply: REPLY.into(),
             at_edge: Box::new(at_edge),
         });
-        let lines =
-            Lines { tx: wire.clone(), rx: wire.clone(), single: None, pace: Pace::of(clock), bit: BIT, spoilt: false };
+        let lines = Lines {
+            wire: super::Wire { tx: wire.clone(), single: None },
+            rx: wire.clone(),
+            pace: Pace::of(clock),
+            bit: BIT,
+            spoilt: false,
+        };
         let mut message = Message::default();
         message.data[..MESSAGE.len()].copy_from_slice(&MESSAGE);
         message.write_len = MESSAGE.len();

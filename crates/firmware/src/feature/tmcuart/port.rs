@@ -3,7 +3,7 @@
 //!
 //! klippy's bits become bytes, and the bytes of the reply become bits again. With the usual cabling, RX is connected to
 //! the driver's only wire, and TX through a resistor. So the port also receives what it sends: the echo. It comes before
-//! the reply, and is taken off. With other cabling there is no echo. The received bytes themselves tell: an echo repeats
+//! the reply, and is taken off. With other cabling there is no echo. The received bytes themselves show it: an echo repeats
 //! the message from its first byte on. A reply cannot be taken for an echo. It begins with 05 FF, and FF is no driver's
 //! address.
 //!
@@ -14,9 +14,8 @@
 
 use std::time::Duration;
 
-use log::warn;
-
 use crate::board::SerialPort;
+use crate::mcu::DeviceWarning;
 use crate::time::{NS_PER_TICK, Ticks};
 use crate::trouble::Trouble;
 
@@ -42,6 +41,9 @@ enum Heard {
     Garbage,
 }
 
+/// The first words of each warning.
+const SUBJECT: &str = "TMC UART";
+
 /// The port.
 pub(super) struct Port {
     device: Box<dyn SerialPort>,
@@ -51,10 +53,12 @@ pub(super) struct Port {
     limit: Duration,
     /// Whether the port received its own messages so far.
     echoes: bool,
-    /// The faults that the log already names, each with the driver's address.
-    told: Vec<(Heard, u8)>,
-    /// Whether the log already says that the port failed.
+    /// The faults that it has warned of, each with the driver's address.
+    warned: Vec<(Heard, u8)>,
+    /// Whether there was a warning that the port failed.
     failed: bool,
+    /// A warning for the log.
+    pub(super) warning: Option<DeviceWarning>,
 }
 
 impl Port {
@@ -62,7 +66,7 @@ impl Port {
     pub(super) fn new(device: Box<dyn SerialPort>, name: String, bit: Ticks) -> Port {
         let bits = u64::from(TURN_BITS + REPLY_BITS) + FRAME_BITS as u64;
         let limit = Duration::from_nanos(bits * u64::from(bit.0) * NS_PER_TICK) + LATE_MAX;
-        Port { device, name, limit, echoes: true, told: Vec::new(), failed: false }
+        Port { device, name, limit, echoes: true, warned: Vec::new(), failed: false, warning: None }
     }
 
     /// Sends a message, and receives its reply.
@@ -70,10 +74,11 @@ impl Port {
         let (sent, len) = bytes_of(message.bits());
         let sent = &sent[..len];
         match self.converse(sent, message) {
-            Ok(heard) => self.tell(heard, sent.get(1).copied().unwrap_or_default()),
+            Ok(heard) => self.warn(heard, sent.get(1).copied().unwrap_or_default()),
             Err(trouble) => {
                 if !std::mem::replace(&mut self.failed, true) {
-                    warn!("{}", trouble.of(format_args!("TMC UART {}", self.name)));
+                    let trouble = trouble.of(format_args!("{SUBJECT} {}", self.name));
+                    self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
                 }
             }
         }
@@ -129,28 +134,27 @@ impl Port {
         Ok(())
     }
 
-    /// Logs each fault once for each driver.
-    fn tell(&mut self, heard: Heard, address: u8) {
-        if heard == Heard::All || self.told.contains(&(heard, address)) {
+    /// Warns of each fault once for each driver.
+    fn warn(&mut self, heard: Heard, address: u8) {
+        if heard == Heard::All || self.warned.contains(&(heard, address)) {
             return;
         }
-        self.told.push((heard, address));
-        let name = &self.name;
-        match heard {
-            Heard::All => {}
-            Heard::Nothing => warn!(
-                "TMC UART {name}: it receives nothing, not even its own message: connect RX to the driver's UART pin, and TX to it through 1 kOhm, or free the port if another program reads it (pinion doctor); said once"
-            ),
-            Heard::Echo => warn!(
-                "TMC UART {name}: no driver answers at address {address}: check uart_address, the driver's motor supply, and the resistor of 1 kOhm at TX; said once"
+        self.warned.push((heard, address));
+        let text = match heard {
+            Heard::All => return,
+            Heard::Nothing => "it receives nothing, not even its own message: connect RX to the driver's UART pin, and TX to it through 1 kOhm, or free the port if another program reads it (pinion doctor); said once".to_owned(),
+            Heard::Echo => format!(
+                "no driver answers at address {address}: check uart_address, the driver's motor supply, and the resistor of 1 kOhm at TX; said once"
             ),
             Heard::Garbage => {
                 let faults = self.device.faults().unwrap_or_else(|| "the port counts no fault".to_owned());
-                warn!(
-                    "TMC UART {name}: the answer at address {address} is garbage ({faults}): check the wires, the resistor of 1 kOhm at TX, and that no other program uses the port (pinion doctor); said once"
-                );
+                format!(
+                    "the answer at address {address} is garbage ({faults}): check the wires, the resistor of 1 kOhm at TX, and that no other program uses the port (pinion doctor); said once"
+                )
             }
-        }
+        };
+        let trouble = Trouble::new(text).of(format_args!("{SUBJECT} {}", self.name));
+        self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
     }
 }
 

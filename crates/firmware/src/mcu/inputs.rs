@@ -1,0 +1,140 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Input lines: the core reads them, or the worker of their chip.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use crate::board::Line;
+use crate::shutdown::{Shutdown, reason};
+use crate::time::Clock;
+
+use super::lines::{Claim, Level, Repeated};
+use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
+use crate::board::Pin;
+
+/// Reads an input of a chip that may sleep.
+struct Read;
+
+impl Job for Read {
+    type Device = Repeated;
+    type Out = bool;
+    type Failure = Shutdown;
+
+    fn run(&mut self, line: &mut Repeated) -> Result<bool, Shutdown> {
+        line.read()
+    }
+}
+
+/// The result of a worker's look at an input.
+pub struct Look {
+    /// `None` if the look failed.
+    pub level: Option<bool>,
+    /// When the worker began to look.
+    pub began: Clock,
+    /// When the worker finished.
+    pub ended: Clock,
+}
+
+/// An input line of any chip.
+pub struct InputLine {
+    pin: Pin,
+    sensor: Sensor,
+    level: Arc<Level>,
+}
+
+enum Sensor {
+    Prompt(Arc<dyn Line>),
+    Slow { line: DeviceId<Repeated>, look: JobSlot<Read>, unread: Unread },
+}
+
+impl InputLine {
+    /// The object gets the worker's reads back under `number`.
+    pub(super) fn new(number: u8, claim: &Claim) -> InputLine {
+        let sensor = match claim.slow() {
+            None => Sensor::Prompt(claim.line()),
+            Some(line) => Sensor::Slow { line, look: JobSlot::numbered(number, Read), unread: Unread::default() },
+        };
+        InputLine { pin: claim.pin(), sensor, level: claim.level() }
+    }
+
+    /// The line's level. `None` if the chip's worker has to look: the level then comes later, to the object's
+    /// `finished`.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    #[inline]
+    pub fn read(&mut self, context: &mut Context) -> Result<Option<bool>, Shutdown> {
+        if let Sensor::Slow { line, look, unread } = &mut self.sensor
+            && look.is_here()
+        {
+            unread.asked(context.now());
+            look.send(context, *line)?;
+        }
+        self.prompt_level()
+    }
+
+    /// The line's level; `None` if the chip's worker would have to look.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    #[inline]
+    pub fn prompt_level(&self) -> Result<Option<bool>, Shutdown> {
+        match &self.sensor {
+            Sensor::Prompt(line) => line.read().inspect(|level| self.level.set(*level)).map(Some),
+            Sensor::Slow { .. } => Ok(None),
+        }
+    }
+
+    /// Whether the chip's worker is looking at the line.
+    pub fn is_looking(&self) -> bool {
+        matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
+    }
+
+    /// Handles a finished look. It fails with "GPIO line read failed" when no look has
+    /// succeeded for [`UNREAD_LIMIT`].
+    pub fn sampled(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, finished, false)
+    }
+
+    /// The same, if a move depends on the input. One failed look is a failure at once.
+    pub fn seen(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+        self.take_in(context, finished, true)
+    }
+
+    fn take_in(&mut self, context: &Context, finished: Finished, at_once: bool) -> Option<Result<Look, Shutdown>> {
+        let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
+        let Back { result, began, ended, .. } = look.back(finished)?;
+        let level = match result {
+            Ok(level) => {
+                unread.read();
+                self.level.set(level);
+                Ok(Some(level))
+            }
+            Err(failure) if at_once || unread.is_too_long(ended) => {
+                context.try_shut_down(failure.clone()).map(|()| None)
+            }
+            Err(_) => Ok(None),
+        };
+        Some(level.map(|level| Look { level, began, ended }))
+    }
+
+    /// Checks a look that may still be on its way. Call this while one may be.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed" when no look has succeeded for [`UNREAD_LIMIT`].
+    pub fn awaited(&self, context: &mut Context) -> Result<(), Shutdown> {
+        let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
+        if look.is_here() || !unread.is_too_long(context.now()) {
+            return Ok(());
+        }
+        let (name, ms) = (context.name(self.pin), UNREAD_LIMIT.as_ms());
+        let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
+        context.try_shut_down(
+            stop.remedy("check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART"),
+        )
+    }
+}
