@@ -19,6 +19,7 @@ use pinion::cli::run::{self, RunArgs};
 use pinion::cli::{LogArgs, completions, logging};
 use printer::SimArgs;
 
+mod boards;
 mod camera;
 mod demo;
 mod description;
