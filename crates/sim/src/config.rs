@@ -119,6 +119,18 @@ impl SimConfig {
         toml::to_string(self).map_err(|error| Trouble::new(error.to_string()).remedy("please report it"))
     }
 
+    /// The place of an axis, in millimeters or radians, with the nozzle at this place. `None` if the axis does not move the
+    /// nozzle, or the nozzle cannot be there.
+    pub fn axis_place(&self, axis: &str, nozzle_mm: [f64; 3]) -> Option<f64> {
+        let kinematics = self.printer().kinematics();
+        let rail = kinematics.rails().iter().position(|rail| *rail == axis)?;
+        let place = match kinematics.linkage() {
+            Some(linkage) => linkage.places(nozzle_mm)[rail],
+            None => nozzle_mm[rail],
+        };
+        place.is_finite().then_some(place)
+    }
+
     /// Whether the motor of this axis moves more than the axis, for example a belt of a CoreXY printer. Alone it homes no
     /// axis.
     pub fn is_on_belts(&self, axis: &str) -> bool {

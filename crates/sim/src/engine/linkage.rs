@@ -8,7 +8,8 @@
 use std::f64::consts::PI;
 
 use crate::description::axes::DeltaConfig;
-use crate::description::kinematics::{DeltesianConfig, RotaryDeltaConfig, WinchConfig};
+use crate::description::kinematics::{RotaryDeltaConfig, WinchConfig};
+use crate::description::printer::Kinematics;
 
 /// Highest number of rails.
 pub(crate) const RAILS_MAX: usize = WinchConfig::CABLES.len();
@@ -34,9 +35,17 @@ impl From<&DeltaConfig> for Linkage {
     }
 }
 
-impl From<&DeltesianConfig> for Linkage {
-    fn from(config: &DeltesianConfig) -> Linkage {
-        Linkage::Deltesian { arms_mm: config.arms_mm, arm_x_mm: config.arm_x_mm }
+impl Kinematics<'_> {
+    /// The geometry of a kinematics without a gantry.
+    pub(crate) fn linkage(&self) -> Option<Linkage> {
+        Some(match *self {
+            Kinematics::Delta(delta) => delta.into(),
+            Kinematics::Deltesian(config) => Linkage::Deltesian { arms_mm: config.arms_mm, arm_x_mm: config.arm_x_mm },
+            Kinematics::Polar => Linkage::Polar,
+            Kinematics::RotaryDelta(rotary) => Linkage::RotaryDelta(rotary.clone()),
+            Kinematics::Winch(winch) => Linkage::Winch { anchors_mm: winch.anchors_mm.clone() },
+            _ => return None,
+        })
     }
 }
 
@@ -201,8 +210,8 @@ mod tests {
                 angles_degrees: [210.0, 331.0, 90.0],
             };
             assert_there_and_back(&Linkage::from(&delta), nozzle_mm)?;
-            let deltesian = DeltesianConfig { arms_mm: [217.0, 218.0], arm_x_mm: [120.0, 121.0] };
-            assert_there_and_back(&Linkage::from(&deltesian), nozzle_mm)?;
+            let deltesian = Linkage::Deltesian { arms_mm: [217.0, 218.0], arm_x_mm: [120.0, 121.0] };
+            assert_there_and_back(&deltesian, nozzle_mm)?;
             assert_there_and_back(&Linkage::Polar, nozzle_mm)?;
             assert_there_and_back(&Linkage::RotaryDelta(rotary()), nozzle_mm)?;
             let low = [[0.0, -2000.0, -100.0], [2000.0, 1000.0, -100.0], [-2000.0, 1000.0, -100.0], [0.0, 0.0, 3000.0]];

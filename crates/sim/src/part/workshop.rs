@@ -11,7 +11,6 @@ use crate::description::pin::PinName;
 use crate::description::printer::{Kinematics, Printer};
 use crate::engine::bed::{Bed, BedShape, Hanging, Head, Plane};
 use crate::engine::i2c::{I2cBus, I2cChip};
-use crate::engine::linkage::Linkage;
 use crate::engine::motion::{Axis, Rail};
 use crate::engine::noise::Noise;
 use crate::engine::physics::Heater;
@@ -117,21 +116,19 @@ impl Workshop<'_> {
         let kinematics = self.printer.kinematics();
         let rails: Vec<Arc<Rail>> = kinematics.rails().iter().filter_map(|name| self.rail(name)).collect();
         let end_mm = |rail: usize| rails.get(rail).and_then(|rail| rail.travel_mm).unwrap_or_default();
-        let (linkage, bed) = match kinematics {
-            Kinematics::Delta(delta) => (delta.into(), disc(delta.bed_radius_mm)),
-            Kinematics::RotaryDelta(rotary) => (Linkage::RotaryDelta(rotary.clone()), disc(rotary.bed_radius_mm)),
-            Kinematics::Polar => (Linkage::Polar, disc(end_mm(1).1)),
-            Kinematics::Winch(winch) => {
-                (Linkage::Winch { anchors_mm: winch.anchors_mm.clone() }, disc(winch.bed_radius_mm))
-            }
+        let bed = match kinematics {
+            Kinematics::Delta(delta) => disc(delta.bed_radius_mm),
+            Kinematics::RotaryDelta(rotary) => disc(rotary.bed_radius_mm),
+            Kinematics::Polar => disc(end_mm(1).1),
+            Kinematics::Winch(winch) => disc(winch.bed_radius_mm),
             Kinematics::Deltesian(deltesian) => {
                 let (front_mm, back_mm) = end_mm(2);
                 let [left_mm, right_mm] = deltesian.arm_x_mm;
-                let bed = BedShape::Rectangle { min_mm: [-left_mm, front_mm], max_mm: [right_mm, back_mm] };
-                (deltesian.into(), bed)
+                BedShape::Rectangle { min_mm: [-left_mm, front_mm], max_mm: [right_mm, back_mm] }
             }
             _ => return None,
         };
+        let linkage = kinematics.linkage()?;
         Some(Hanging::new(linkage, rails, bed))
     }
 
