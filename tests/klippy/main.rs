@@ -8,6 +8,7 @@
 mod drivers;
 mod filament;
 mod hosts;
+mod kinematics;
 mod klippy;
 mod leveling;
 mod links;

@@ -20,6 +20,7 @@ use pinion::cli::{LogArgs, completions, logging};
 use printer::SimArgs;
 
 mod attempt;
+mod boards;
 mod camera;
 mod demo;
 mod description;

@@ -21,14 +21,13 @@ use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
-use pinion_linux::sys;
 use pinion_printer_config::Trouble;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
-use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
-use pinion_trace::folder::folders;
+use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
 use crate::attempt::{self, Attempt};
+use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
 use crate::description::read;
 use crate::own;
@@ -140,28 +139,28 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(owner) => owner,
         Err(error) => return failed(error),
     };
-    let symlink = match &owner {
-        Some(owner) => owner.place.links(&owner.own, args.symlink.as_deref()).swap_remove(0),
-        None => args.symlink.clone().unwrap_or_else(|| LINK.into()),
+    let links = match &owner {
+        Some(owner) => owner.place.links(&owner.own, args.symlink.as_deref()),
+        None => boards::links(args.symlink.as_deref().unwrap_or(Path::new(LINK)), &config),
     };
+    let symlink = links[0].clone();
     let clock = Monotonic::start();
-    let recording = Recording::new(clock, &symlink, args.realtime, folders());
-    let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true, sys::SERVE)?, recording)));
-    let (helpers, recording) = match helpers {
+    let mut started = match boards::start(&links, clock, args.realtime) {
         Ok(started) => started,
         Err(error) => return failed(error),
     };
+    let (_, recording, helpers) = started.remove(0);
     logging::detach();
     let camera = match args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose() {
         Ok(camera) => camera,
         Err(error) => return failed(error),
     };
     let plan = plan(&config);
-    let board = match SimBoard::new(config, Arc::new(clock)) {
-        Ok(board) => board,
+    let SimWorld { mut boards, probe } = match SimWorld::new(config, Arc::new(clock)) {
+        Ok(world) => world,
         Err(error) => return failed(error),
     };
-    let probe = board.probe();
+    let board = boards.remove(0);
     let sockets = pinion_runtime::socket_paths(&symlink);
     let own = match (args.show || camera.is_some()).then(|| OwnStatus::start(sockets.clone(), &symlink)).transpose() {
         Ok(own) => own.unwrap_or_default(),
@@ -185,8 +184,14 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         trace_edges: args.trace_edges,
         sockets,
     };
-    if owner.is_some() || args.show || path.is_some() || spi_trace.is_some() {
-        return serve(args, board, (probe, own), &options, (recording, helpers), (path, spi_trace), owner);
+    let several = !boards.is_empty();
+    let others = match Others::serve(boards, started, &options) {
+        Ok(others) => others,
+        Err(error) => return failed(error),
+    };
+    if owner.is_some() || args.show || path.is_some() || spi_trace.is_some() || several {
+        let served = serve(args, board, (probe, own), &options, (recording, helpers), (path, spi_trace), owner);
+        return if others.end() { served } else { ExitCode::FAILURE };
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set when the program is asked to end. A demonstration that this interrupts has not failed.
@@ -410,7 +415,7 @@ fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
     Some(HeaterPlan {
         name: heater.name.clone(),
         heater: pin(heater.pin.as_ref()?),
-        sensor: heater.sensor_pin.name.clone(),
+        sensor: heater.sensor_pin.as_ref()?.name.clone(),
         thermistor: heater.thermistor().ok()?,
         min_c: heater.min_celsius,
         max_c: heater.max_celsius,

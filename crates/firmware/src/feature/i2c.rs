@@ -16,7 +16,7 @@ use crate::mcu::{
     only, response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
-use crate::time::Ticks;
+use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -192,6 +192,12 @@ impl I2c {
     }
 
     fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
+        let rate_hz = CLOCK_FREQ.checked_div(2 * pulse.0).unwrap_or(CLOCK_FREQ);
+        let config = I2cConfig { bus: 0, address: seven_bits(address), rate_hz };
+        if let Some(opened) = mcu.board()?.i2c_on_lines(pins, config) {
+            self.bus = Some(mcu.bus(opened)?);
+            return Ok(());
+        }
         let [scl, sda] = pins;
         let lines = (mcu.shared_wire(scl)?, mcu.shared_wire(sda)?);
         let name = format!("scl {} sda {} address {:#04x}", mcu.name(scl), mcu.name(sda), seven_bits(address));

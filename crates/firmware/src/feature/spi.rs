@@ -181,6 +181,12 @@ impl Spi {
 
     fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
         self.may_have_bus(mcu, mode)?;
+        let rate_hz = CLOCK_FREQ.checked_div(pulse.0).unwrap_or(CLOCK_FREQ);
+        let config = SpiConfig { bus: 0, mode, rate_hz, chip_select: self.chip_select.clone() };
+        if let Some(opened) = mcu.board()?.spi_on_lines(pins, &config) {
+            self.bus = Some(mcu.bus(opened)?);
+            return Ok(());
+        }
         let [miso, mosi, sclk] = pins;
         // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {
