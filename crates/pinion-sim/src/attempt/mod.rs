@@ -51,6 +51,17 @@ const GCODE_MIB: u64 = 256;
 const STARTS: [&str; 4] = ["START_PRINT", "PRINT_START", "START_GCODE", "BEGIN_PRINT"];
 const ENDS: [&str; 3] = ["END_PRINT", "PRINT_END", "END_GCODE"];
 
+/// Words of a stop because a computer is too busy.
+const BUSY: [&str; 5] = [
+    "Timer too close",
+    "Rescheduled timer in the past",
+    "Missed scheduling of next",
+    "Lost communication with MCU",
+    "Communication timeout during homing",
+];
+/// How often a step is repeated because of them.
+const TRIES: u32 = 2;
+
 /// What is tried, and how.
 #[derive(Clone, Debug)]
 pub(crate) struct Attempt {
@@ -95,7 +106,7 @@ pub(crate) fn run(
         report.progress(step.name);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
-            None => (step.run)(&mut trial),
+            None => trial.tried(step),
         };
         if matches!(outcome, Outcome::Failed { .. }) {
             trial.recover(step.name);
@@ -150,11 +161,22 @@ impl Trial<'_> {
         Outcome::Failed { cause, place }
     }
 
+    /// klippy's words about a refusal: those about its stop, if it stopped.
+    fn why(&mut self, words: String) -> String {
+        match self.host.state() {
+            Ok((state, about)) if state != "ready" => about,
+            _ => words,
+        }
+    }
+
     /// Runs G-code. The error is the outcome.
     fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
         match self.host.gcode(script, limit) {
             Ok(()) => Ok(()),
-            Err(Refused::Error(words)) => Err(self.failed(format!("{script}: {words}"), None)),
+            Err(Refused::Error(words)) => {
+                let words = self.why(words);
+                Err(self.failed(format!("{script}: {words}"), None))
+            }
             Err(Refused::Late) => {
                 self.host.stop();
                 Err(self.failed(format!("{script}: it takes longer than {} s", limit.as_secs()), None))
@@ -164,6 +186,22 @@ impl Trial<'_> {
                 Err(self.failed(format!("{script}: klippy is gone: {why}"), None))
             }
         }
+    }
+
+    /// Runs a step. It is repeated if the computer was too busy for it: that says nothing about the printer.
+    fn tried(&mut self, step: &Step) -> Outcome {
+        for _ in 0..TRIES {
+            let outcome = (step.run)(self);
+            let Outcome::Failed { cause, .. } = &outcome else { return outcome };
+            if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
+                return outcome;
+            }
+            let _ = self.host.gcode("FIRMWARE_RESTART", READY);
+            if self.until_ready().is_err() || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err() {
+                return outcome;
+            }
+        }
+        (step.run)(self)
     }
 
     /// After a failure: goes on if klippy is ready, or is so after a restart.
@@ -598,7 +636,10 @@ impl Trial<'_> {
     fn gcode_block(&mut self, block: &str) -> Result<(), Outcome> {
         match self.host.gcode(block, PRINT) {
             Ok(()) => Ok(()),
-            Err(Refused::Error(words)) => Err(self.failed(words, None)),
+            Err(Refused::Error(words)) => {
+                let words = self.why(words);
+                Err(self.failed(words, None))
+            }
             Err(refused) => Err(self.failed(format!("the print stopped: {refused:?}"), None)),
         }
     }

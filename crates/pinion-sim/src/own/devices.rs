@@ -251,7 +251,8 @@ impl Translator<'_> {
         };
         let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
         let bus = self.i2c(section)?;
-        let part = Entry::default().set("kind", "i2c_register").set("chip", kind).set("bus", bus);
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
         self.out.add("part", part.set("address", address));
         Ok(())
     }
@@ -259,7 +260,8 @@ impl Translator<'_> {
     fn dac(&mut self, section: &Section) -> Result<(), Trouble> {
         section.required("enable_pin")?;
         let Some((bus, select)) = self.spi(section, "enable_pin")? else { return Ok(()) };
-        let part = Entry::default().set("kind", "spi_dac").set("chip", section.kind().to_lowercase());
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "spi_dac").set("name", name).set("chip", section.kind().to_lowercase());
         self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
         Ok(())
     }

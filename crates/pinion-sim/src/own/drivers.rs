@@ -36,15 +36,13 @@ impl Translator<'_> {
         section.required("cs_pin")?;
         let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
         let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
-        if let Some(length) = section.whole("chain_length", 2)? {
-            let position = section.whole("chain_position", 1)?.unwrap_or(1);
-            part = part.set("chain_length", length).set("chain_position", position);
-            // The chips of a chain share their select pin.
-            part = part.set_if("select_pin", self.pin(section, "cs_pin")?.map(|pin| pin.to_string()));
-        } else {
-            part = part.set_if("select_pin", select);
+        if section.whole("chain_length", 2)?.is_some() {
+            self.note(section, "is in a chain of drivers, which is not simulated", "its driver does not answer");
+            return Ok(());
         }
-        for key in ["diag0_pin", "diag1_pin"] {
+        part = part.set_if("select_pin", select);
+        let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
+        for key in diags {
             part = part.set_if(key, self.take(section, key)?);
         }
         self.out.add("part", part);
@@ -65,10 +63,9 @@ impl Translator<'_> {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
             part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
         }
-        // An analog multiplexer chooses the driver by these pins.
-        let select: Vec<toml::Value> = section.list("select_pins", ',').into_iter().map(Into::into).collect();
-        if !select.is_empty() {
-            part = part.set("select_pins", select);
+        if section.text("select_pins").is_some() {
+            self.note(section, "is behind a multiplexer, which is not simulated", "its driver does not answer");
+            return Ok(());
         }
         self.out.add("part", part);
         Ok(())

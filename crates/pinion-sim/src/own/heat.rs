@@ -54,7 +54,9 @@ impl Translator<'_> {
         };
         let klippys = section.own_name().unwrap_or(&section.name).to_owned();
         let name = self.out.name("heater", &klippys);
-        let pin = self.take(section, "heater_pin")?;
+        // A pin of another chip drives nothing here, and klippy needs one.
+        let nothing = section.text("heater_pin").map(|_| self.out.name("nothing", &format!("nothing_{name}")));
+        let pin = self.take(section, "heater_pin")?.or(nothing);
         let min = section.number("min_temp", Limit::Any)?.unwrap_or(0.0);
         let max = section.number("max_temp", Limit::Any)?.unwrap_or(100.0);
         let start = AMBIENT_CELSIUS.clamp(min.min(max), max.max(min));
@@ -146,7 +148,8 @@ impl Translator<'_> {
                 };
                 let address = section.whole("i2c_address", 0)?.unwrap_or(address);
                 let bus = self.i2c(section)?;
-                let part = part.set("kind", "i2c_sensor").set("chip", chip).set("bus", bus);
+                let name = self.out.name("part", heater);
+                let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
                 self.out.add("part", part.set("address", address));
             }
             _ => {

@@ -179,7 +179,8 @@ pub(super) fn sensor(config: &Config, section: &Section, entry: Entry) -> Result
             own.required(&celsius).and(own.required(&ohm))?;
             points.push((number(own, &celsius, 0.0)?, number(own, &ohm, 0.0)?));
         }
-        return Ok(Some(thermistor(entry, &points, beta)));
+        let (points, beta) = as_klippy_takes_them(&points, beta);
+        return Ok(Some(thermistor(entry, points, beta)));
     }
     if let Some(own) = config.section(&format!("adc_temperature {name}")) {
         let of = |kind: &str| {
@@ -216,6 +217,18 @@ pub(super) fn sensor(config: &Config, section: &Section, entry: Entry) -> Result
         }
         _ => Ok(None),
     }
+}
+
+/// The points that count. Through some three points no thermistor's curve leads, and klippy takes the first one with the
+/// beta between the first and the last (`thermistor.py`).
+fn as_klippy_takes_them(points: &Points, beta: Option<f64>) -> (&Points, Option<f64>) {
+    let (Some(&[(t1, r1), (t2, r2), (t3, r3)]), None) = (points.first_chunk(), beta) else { return (points, beta) };
+    let inverse = |celsius: f64| 1.0 / (celsius + KELVIN);
+    let (l1, l2, l3) = (r1.ln(), r2.ln(), r3.ln());
+    let (by12, by13) = (inverse(t1) - inverse(t2), inverse(t1) - inverse(t3));
+    let ratio = (l1 - l2) / (l1 - l3);
+    let c3 = (by12 - by13 * ratio) / (l1.powi(3) - l2.powi(3) - (l1.powi(3) - l3.powi(3)) * ratio);
+    if c3 > 0.0 { (points, None) } else { (&points[..1], Some((l1 - l3) / by13)) }
 }
 
 /// A curve as fractions of the ADC's reference, as far as the ADC measures them.
