@@ -13,6 +13,7 @@ mod klippy;
 mod leveling;
 mod links;
 mod mainsail;
+mod own_printer;
 mod print;
 mod printer_cfg;
 mod probes;

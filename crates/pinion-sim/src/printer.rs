@@ -98,7 +98,7 @@ struct Owner {
 
 impl Owner {
     fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
-        let attempt = args.own.attempt()?;
+        let attempt = args.own.attempt(args.realtime)?;
         let place = Place::make(&own, &args.own, args.symlink.as_deref())?;
         Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
     }

@@ -56,7 +56,7 @@ impl Host {
     /// # Errors
     ///
     /// It cannot be started, or opens no API.
-    pub(super) fn start(klipper: &Path, python: &Path, folder: &Folder) -> Result<Host, Trouble> {
+    pub(super) fn start(klipper: &Path, python: &Path, folder: &Folder, realtime: bool) -> Result<Host, Trouble> {
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
         if !program.is_file() {
@@ -66,11 +66,12 @@ impl Host {
         let socket = folder.path.join("klippy.sock");
         let _ = std::fs::remove_file(&socket);
         let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
-        // While it homes, klippy is a tenth of a second ahead of the MCU, and a busy computer makes it late. Only root may
-        // put it first.
-        let nice = if nix::unistd::geteuid().is_root() { "-15" } else { "0" };
-        let mut command = Command::new("nice");
-        command.args(["-n", nice]).arg(python).arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
+        // While it homes, klippy is a tenth of a second ahead of the MCU, and a busy computer makes it late.
+        let mut command = Command::new(if realtime { Path::new("chrt") } else { python });
+        if realtime {
+            command.args(["-f", "1"]).arg(python);
+        }
+        command.arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
         command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
         command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
         // A Ctrl-C ends this program, which ends klippy.

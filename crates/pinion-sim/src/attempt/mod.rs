@@ -72,6 +72,8 @@ pub(crate) struct Attempt {
     /// Only these steps, if there are any.
     pub(crate) only: Vec<String>,
     pub(crate) json: bool,
+    /// klippy gets real time, too.
+    pub(crate) realtime: bool,
 }
 
 /// Tries a printer. Returns whether nothing failed. `ended` is set when the program is asked to end.
@@ -86,7 +88,7 @@ pub(crate) fn run(
     let mut report = Report::new(form);
     let since = Instant::now();
     report.progress("klippy starts");
-    let host = match Host::start(&attempt.klipper, &attempt.python, folder) {
+    let host = match Host::start(&attempt.klipper, &attempt.python, folder, attempt.realtime) {
         Ok(host) => host,
         Err(trouble) => {
             report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, since);
@@ -197,7 +199,9 @@ impl Trial<'_> {
                 return outcome;
             }
             let _ = self.host.gcode("FIRMWARE_RESTART", READY);
-            if self.until_ready().is_err() || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err() {
+            if self.until_ready().is_err()
+                || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err()
+            {
                 return outcome;
             }
         }

@@ -30,6 +30,9 @@ pub(super) fn place_of(config: &Config, message: &str) -> Option<Place> {
     let texts = quoted(message);
     let lower = message.to_lowercase();
     let section = |name: &str| config.section(name.trim_matches(['[', ']']));
+    // "MCU 'mcu' shutdown: ..." is about no line of its own.
+    let texts: Vec<&str> =
+        texts.into_iter().filter(|text| !lower.contains(&format!("mcu '{}'", text.to_lowercase()))).collect();
     // "Option 'x' in section 'y' ...", "Choice 'c' for option 'o' in section 's' ..."
     if lower.contains("section")
         && let Some(found) = texts.iter().rev().find_map(|text| section(text))
@@ -122,6 +125,7 @@ mod tests {
             ("Endstop x still triggered after retract", 3),
             ("Unable to read tmc uart 'stepper_x' register IFCNT", 11),
             ("Heater extruder not heating at expected rate", 4),
+            ("MCU 'mcu' shutdown: Heater extruder", 4),
         ] {
             assert_eq!(place_of(&config, message).map(|place| place.line), Some(line), "{message}");
         }

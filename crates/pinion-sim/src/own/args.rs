@@ -67,12 +67,19 @@ impl OwnArgs {
     /// # Errors
     ///
     /// There is no klippy.
-    pub(crate) fn attempt(&self) -> Result<Option<Attempt>, Trouble> {
+    pub(crate) fn attempt(&self, realtime: bool) -> Result<Option<Attempt>, Trouble> {
         if !self.attempt {
             return Ok(None);
         }
         let klipper = attempt::klipper(self.klipper.as_deref())?;
         let python = attempt::python(self.python.as_deref(), &klipper);
-        Ok(Some(Attempt { klipper, python, gcode: self.gcode.clone(), only: self.only.clone(), json: self.json }))
+        Ok(Some(Attempt {
+            klipper,
+            python,
+            gcode: self.gcode.clone(),
+            only: self.only.clone(),
+            json: self.json,
+            realtime,
+        }))
     }
 }

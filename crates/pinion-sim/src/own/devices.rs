@@ -76,7 +76,7 @@ impl Translator<'_> {
     }
 
     fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
-        let bus = self.i2c(section)?;
+        let Some(bus) = self.i2c(section)? else { return Ok(()) };
         let address = section.whole("i2c_address", 0)?.unwrap_or(42);
         let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
         for axis in ["x", "y"] {
@@ -140,6 +140,21 @@ impl Translator<'_> {
         Ok(())
     }
 
+    /// Strips on a data line each: an SPI bus of which only the output is in use. They come last, because klippy takes the
+    /// first bus where a section names none.
+    pub(super) fn strips(&mut self) -> Result<(), Trouble> {
+        for section in self.config.of_kind("neopixel") {
+            let Some(pin) = self.take(section, "pin")? else { continue };
+            let name = self.name_of("part", section);
+            let order = section.list("color_order", ',').first().map_or("GRB".to_owned(), |order| order.to_uppercase());
+            let count = section.whole("chain_count", 1)?.unwrap_or(1);
+            self.out.add("spi_bus", Entry::default().set("name", pin.as_str()));
+            let part = Entry::default().set("kind", "ws2812").set("name", name).set("count", count);
+            self.out.add("part", part.set("bus", pin).set("color_order", order));
+        }
+        Ok(())
+    }
+
     fn led(&mut self, section: &Section) -> Result<(), Trouble> {
         let keys = [("red_pin", "red_pin"), ("green_pin", "green_pin"), ("blue_pin", "blue_pin"), ("white_pin", "pin")];
         let name = self.name_of("led", section);
@@ -174,7 +189,7 @@ impl Translator<'_> {
             return Ok(());
         }
         if section.text("cs_pin").is_none() {
-            let bus = self.i2c(section)?;
+            let Some(bus) = self.i2c(section)? else { return Ok(()) };
             let name = self.name_of("part", section);
             let address = section.whole("i2c_address", 0)?.unwrap_or(60);
             let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
@@ -250,7 +265,7 @@ impl Translator<'_> {
             }
         };
         let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
-        let bus = self.i2c(section)?;
+        let Some(bus) = self.i2c(section)? else { return Ok(()) };
         let name = self.name_of("part", section);
         let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
         self.out.add("part", part.set("address", address));

@@ -327,7 +327,11 @@ impl<'a> Translator<'a> {
             let rail = Rail { min: 0.0, max: highest, endstop: highest, at_max: true };
             self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, highest - BEFORE_ENDSTOP_MM));
         }
-        let entry = Entry::default().set("kind", "delta").set("radius_mm", radius).set("arm_mm", arms[0]).set("bed_radius_mm", bed_radius);
+        let entry = Entry::default()
+            .set("kind", "delta")
+            .set("radius_mm", radius)
+            .set("arm_mm", arms[0])
+            .set("bed_radius_mm", bed_radius);
         let entry = entry.numbers("arms_mm", arms).numbers("angles_degrees", angles);
         self.out.set("kinematics", entry);
         Ok(())

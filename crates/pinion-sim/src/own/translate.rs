@@ -57,6 +57,7 @@ pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Troub
     translator.heat()?;
     translator.devices()?;
     translator.drivers()?;
+    translator.strips()?;
     translator.strangers();
     translator.boards();
     Ok(Translated { description: translator.out.into_table(), mcus: translator.mcus, notes: translator.notes })
@@ -180,16 +181,23 @@ impl Translator<'_> {
         Ok(Some((bus, select)))
     }
 
-    /// The I2C bus of a chip.
-    pub(super) fn i2c(&mut self, section: &Section) -> Result<String, Trouble> {
+    /// The I2C bus of a chip. `None` if it shares one line with another bus: the simulation has each line once.
+    pub(super) fn i2c(&mut self, section: &Section) -> Result<Option<String>, Trouble> {
         let mcu = section.text("i2c_mcu").unwrap_or(MAIN).to_owned();
         if section.text("i2c_software_scl_pin").is_some() {
             let [scl, sda] = ["i2c_software_scl_pin", "i2c_software_sda_pin"].map(|key| self.pin(section, key));
             let [scl, sda] = [scl?, sda?].map(|pin| pin.map(|pin| Translator::on(&mcu, &pin.name)));
-            return Ok(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)]));
+            let key = [&scl, &sda].map(|pin| pin.as_deref().unwrap_or("-")).join(" ");
+            let clock = scl.as_ref().and_then(|pin| Pin::parse(pin, true, true).ok());
+            let is_taken = clock.is_some_and(|pin| self.taken.contains_key(&(pin.chip, pin.name)));
+            if is_taken && !self.out.has_bus("i2c_bus", &key) {
+                self.note(section, "shares its clock line with another bus", "its chip is not simulated");
+                return Ok(None);
+            }
+            return Ok(Some(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)])));
         }
         let name = Translator::on(&mcu, section.text("i2c_bus").unwrap_or("i2c"));
-        Ok(self.out.bus("i2c_bus", &name.clone(), || Entry::default().set("name", name)))
+        Ok(Some(self.out.bus("i2c_bus", &name.clone(), || Entry::default().set("name", name))))
     }
 
     /// A bus on bare lines: one for each set of lines.
