@@ -18,7 +18,6 @@ pub(crate) struct RailConfig<'a> {
     pub(crate) start_mm: f64,
     /// The end with the endstop, and the place where it closes.
     pub(crate) endstop: Option<(End, f64)>,
-    pub(crate) endstop_pin: Option<&'a PinName>,
 }
 
 impl<'a> RailConfig<'a> {
@@ -31,7 +30,6 @@ impl<'a> RailConfig<'a> {
             overtravel_mm: axis.overtravel_mm,
             start_mm: axis.start_mm,
             endstop: endstop(axis.endstop_pin.as_ref(), axis.endstop_at, axis.endstop_mm, travel_mm),
-            endstop_pin: axis.endstop_pin.as_ref(),
         }
     }
 
@@ -43,7 +41,6 @@ impl<'a> RailConfig<'a> {
             overtravel_mm: carriage.overtravel_mm,
             start_mm: carriage.start_mm,
             endstop: endstop(carriage.endstop_pin.as_ref(), carriage.endstop_at, carriage.endstop_mm, travel_mm),
-            endstop_pin: carriage.endstop_pin.as_ref(),
         }
     }
 }

@@ -166,6 +166,7 @@ pub struct Stride {
 
 impl Axis {
     /// A motor with a rail of its own.
+    #[cfg(test)]
     pub fn new(config: &AxisConfig) -> Axis {
         let motor = Motor::at(config.start_mm, config);
         let step_mm = 1.0 / config.steps_per_mm;
@@ -293,16 +294,12 @@ impl Axis {
         1.0 / self.steps_per_mm
     }
 
+    #[cfg(test)]
     pub fn position_mm(&self) -> f64 {
         self.rail.position_mm()
     }
 
     pub fn lost_steps(&self) -> u64 {
         self.lost_steps.load(Ordering::Relaxed)
-    }
-
-    /// Whether the endstop is closed; `None` without an endstop.
-    pub fn endstop(&self) -> Option<bool> {
-        self.rail.endstop()
     }
 }

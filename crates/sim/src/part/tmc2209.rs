@@ -450,6 +450,20 @@ mod tests {
         }
     }
 
+    #[test]
+    fn chips_with_other_addresses_share_the_wire() {
+        let mut bench = Bench::new(2);
+        let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
+        let other = Tmc2209::new("other", 2208, (0, SG_FREE), axis);
+        bench.pin.uart.lock().unwrap().solder(Box::new(other));
+        assert_eq!(bench.read(IOIN) >> 24, 0x21);
+        bench.message(&[0xf5, 0, IOIN]);
+        let (_, bytes) = bench.receive().expect("an answer");
+        assert_eq!(bytes[3], 0x20, "a TMC2208");
+        bench.message(&[0xf5, 1, IOIN]);
+        assert!(bench.receive().is_none());
+    }
+
     /// The data sheet's CRC and klippy agree on this example: a read of IFCNT.
     #[test]
     fn the_check_sum_is_crc8_atm() {

@@ -466,7 +466,12 @@ impl SpiChip for Tmc5160 {
         let [.., address, d3, d2, d1, d0] = self.shift.to_be_bytes();
         let data = u32::from_be_bytes([d3, d2, d1, d0]);
         self.reply = if address & WRITE == 0 {
-            self.read(address)
+            let value = self.read(address);
+            // Reading clears the flags of a TMC2130. The others want a one to be written.
+            if self.model == 2130 && address == GSTAT {
+                self.registers.write(GSTAT, value);
+            }
+            value
         } else {
             self.write(address & !WRITE, data);
             data
@@ -488,9 +493,13 @@ mod tests {
 
     impl Bench {
         fn new() -> Bench {
+            Bench::of(5160)
+        }
+
+        fn of(model: u16) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
-            let chip = Tmc5160::new("z".into(), (5160, SG_FREE), axis.clone(), Arc::new(clock.clone()));
+            let chip = Tmc5160::new("z".into(), (model, SG_FREE), axis.clone(), Arc::new(clock.clone()));
             Bench { axis, clock, chip }
         }
 
@@ -539,6 +548,27 @@ mod tests {
         assert_eq!(bench.datagram(GCONF | WRITE, 0x1234_5678).1, 0x1041_0150);
         assert_eq!(bench.datagram(GCONF, 0).1, 0x1234_5678, "what was written, though it has 18 bits");
         assert_eq!(bench.datagram(GCONF, 0).1, 0x0000_5678);
+    }
+
+    #[test]
+    fn each_model_has_its_version_and_its_registers() {
+        for (model, version, chopconf, temperature) in
+            [(5160, 0x30, 0x1041_0150, 0), (2130, 0x11, 0, 0), (2240, 0x40, 0x1041_0150, ADC_35_C)]
+        {
+            let mut bench = Bench::of(model);
+            assert_eq!(bench.read(IOIN) >> 24, version, "{model}");
+            assert_eq!(bench.read(CHOPCONF), chopconf, "{model}");
+            assert_eq!(bench.read(0x51), temperature, "{model}");
+        }
+    }
+
+    #[test]
+    fn reading_clears_the_flags_of_a_tmc2130_only() {
+        for (model, again) in [(2130, 0), (5160, 1), (2240, 1)] {
+            let mut bench = Bench::of(model);
+            assert_eq!(bench.read(GSTAT), 1, "{model}");
+            assert_eq!(bench.read(GSTAT), again, "{model}");
+        }
     }
 
     #[test]
