@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -25,6 +26,8 @@ const MESSAGE_MAX: usize = 64 << 20;
 const START: Duration = Duration::from_secs(60);
 /// How long klippy has to answer a question about its state.
 const ANSWER: Duration = Duration::from_secs(30);
+/// Time between two reads of klippy's state while a command runs.
+const LOOK: Duration = Duration::from_secs(5);
 /// How long klippy has to end in order.
 const END_TIME: Duration = Duration::from_secs(3);
 
@@ -46,6 +49,8 @@ pub(super) struct Host {
     api: UnixStream,
     buffer: Vec<u8>,
     next_id: u64,
+    /// Answers to other questions than the one that is waited for.
+    answers: HashMap<u64, Value>,
     /// What klippy said since the last command.
     pub(super) said: Vec<String>,
 }
@@ -96,32 +101,49 @@ impl Host {
             }
             thread::sleep(Duration::from_millis(50));
         };
-        let mut host = Host { child, socket, api, buffer: Vec::new(), next_id: 0, said: Vec::new() };
+        let mut host =
+            Host { child, socket, api, buffer: Vec::new(), next_id: 0, answers: HashMap::new(), said: Vec::new() };
         let subscribed = host.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER);
         subscribed.map(|_| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
     }
 
     /// A call of the API.
     pub(super) fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
+        let id = self.send(method, params)?;
+        self.answer(id, Instant::now() + limit)
+    }
+
+    /// Sends a question, and returns its number.
+    fn send(&mut self, method: &str, params: Value) -> Result<u64, Refused> {
         self.next_id += 1;
-        let id = self.next_id;
-        let mut request = json!({ "id": id, "method": method, "params": params }).to_string().into_bytes();
+        let mut request = json!({ "id": self.next_id, "method": method, "params": params }).to_string().into_bytes();
         request.push(END);
         self.api.write_all(&request).map_err(|error| Refused::Gone(error.to_string()))?;
-        let until = Instant::now() + limit;
+        Ok(self.next_id)
+    }
+
+    /// Waits for the answer to a question.
+    fn answer(&mut self, id: u64, until: Instant) -> Result<Value, Refused> {
         loop {
-            let message = self.message(until)?;
+            let message = match self.answers.remove(&id) {
+                Some(message) => message,
+                None => self.message(until)?,
+            };
             if let Some(line) = message["params"]["response"].as_str() {
                 self.said.push(line.to_owned());
             }
-            if message["id"] == id {
-                return match &message["error"] {
-                    Value::Null => Ok(message["result"].clone()),
-                    error => {
-                        let words = error["message"].as_str().map_or_else(|| error.to_string(), str::to_owned);
-                        Err(Refused::Error(words))
-                    }
-                };
+            match message["id"].as_u64() {
+                Some(other) if other == id => {
+                    return match &message["error"] {
+                        Value::Null => Ok(message["result"].clone()),
+                        error => {
+                            let words = error["message"].as_str().map_or_else(|| error.to_string(), str::to_owned);
+                            Err(Refused::Error(words))
+                        }
+                    };
+                }
+                Some(other) => _ = self.answers.insert(other, message),
+                None => {}
             }
         }
     }
@@ -153,10 +175,40 @@ impl Host {
         }
     }
 
-    /// Runs G-code to its end.
+    /// Runs G-code to its end. A klippy that stopped may never answer, so its state is read now and then.
     pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
         self.said.clear();
-        self.call("gcode/script", json!({ "script": script }), limit).map(drop)
+        let id = self.send("gcode/script", json!({ "script": script }))?;
+        let until = Instant::now() + limit;
+        let mut stopped = None;
+        loop {
+            match self.answer(id, until.min(Instant::now() + LOOK)) {
+                Err(Refused::Late) if stopped.is_some() => return Err(Refused::Error(stopped.unwrap_or_default())),
+                Err(Refused::Late) if Instant::now() < until => {
+                    let (state, words) = self.state()?;
+                    stopped = (state != "ready").then_some(words);
+                }
+                answer => return answer.map(drop),
+            }
+        }
+    }
+
+    /// Restarts klippy and its MCUs. Its API is another one then.
+    pub(super) fn restart(&mut self) -> Result<(), Refused> {
+        self.send("gcode/firmware_restart", json!({}))?;
+        let until = Instant::now() + START;
+        let gone = |error: std::io::Error| Refused::Gone(error.to_string());
+        // klippy ends all connections when it restarts.
+        while !matches!(self.message(until), Err(Refused::Gone(_) | Refused::Late)) {}
+        self.api = loop {
+            match UnixStream::connect(&self.socket) {
+                Ok(api) => break api,
+                Err(error) if Instant::now() > until => return Err(gone(error)),
+                Err(_) => thread::sleep(Duration::from_millis(50)),
+            }
+        };
+        self.buffer.clear();
+        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
     }
 
     /// klippy's state and its words about it.

@@ -60,7 +60,7 @@ const BUSY: [&str; 5] = [
     "Communication timeout during homing",
 ];
 /// How often a step is repeated because of them.
-const TRIES: u32 = 2;
+const TRIES: u32 = 4;
 
 /// What is tried, and how.
 #[derive(Clone, Debug)]
@@ -198,8 +198,8 @@ impl Trial<'_> {
             if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
                 return outcome;
             }
-            let _ = self.host.gcode("FIRMWARE_RESTART", READY);
-            if self.until_ready().is_err()
+            if self.host.restart().is_err()
+                || self.until_ready().is_err()
                 || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err()
             {
                 return outcome;
@@ -221,8 +221,7 @@ impl Trial<'_> {
             return;
         }
         if step != "ready" && step != "homed" {
-            let _ = self.host.gcode("FIRMWARE_RESTART", READY);
-            if self.until_ready().is_ok() && self.host.gcode("G28", LONG).is_ok() {
+            if self.host.restart().is_ok() && self.until_ready().is_ok() && self.host.gcode("G28", LONG).is_ok() {
                 return;
             }
         }

@@ -57,6 +57,7 @@ pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Troub
     translator.heat()?;
     translator.devices()?;
     translator.drivers()?;
+    translator.bare_buses()?;
     translator.strips()?;
     translator.strangers();
     translator.boards();
@@ -218,6 +219,24 @@ impl Translator<'_> {
         self.out.bus(kind, &key, || {
             lines.into_iter().fold(Entry::default().set("name", name), |entry, (key, pin)| entry.set_if(key, pin))
         })
+    }
+
+    /// The buses of chips that are not simulated: klippy looks for them.
+    fn bare_buses(&mut self) -> Result<(), Trouble> {
+        for section in self.config.sections() {
+            let on_spi = ["cs_pin", "latch_pin"].into_iter().find(|key| section.text(key).is_some());
+            let has_lines = section.kind() == "display" && section.text("lcd_type") == Some("st7920");
+            if let Some(key) = on_spi.filter(|_| !has_lines && section.text("spi_software_sclk_pin").is_none()) {
+                let Some(pin) = self.pin(section, key)?.filter(|pin| self.is_real(pin)) else { continue };
+                let name = Translator::on(&pin.chip, section.text("spi_bus").unwrap_or("spi"));
+                self.out.bus("spi_bus", &name.clone(), || Entry::default().set("name", name));
+            }
+            let on_i2c = ["i2c_bus", "i2c_mcu", "i2c_address"].iter().any(|key| section.text(key).is_some());
+            if on_i2c && section.text("i2c_software_scl_pin").is_none() {
+                self.i2c(section)?;
+            }
+        }
+        Ok(())
     }
 
     /// Says what a user should know.
