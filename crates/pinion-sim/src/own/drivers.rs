@@ -34,12 +34,12 @@ impl Translator<'_> {
     fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
         let axis = self.driven(section)?;
         section.required("cs_pin")?;
-        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
-        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
         if section.whole("chain_length", 2)?.is_some() {
             self.note(section, "is in a chain of drivers, which is not simulated", "its driver does not answer");
             return Ok(());
         }
+        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
         part = part.set_if("select_pin", select);
         let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
         for key in diags {
@@ -53,6 +53,10 @@ impl Translator<'_> {
         let axis = self.driven(section)?;
         section.required("uart_pin")?;
         let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
+        if section.text("select_pins").is_some() {
+            self.note(section, "is behind a multiplexer, which is not simulated", "its driver does not answer");
+            return Ok(());
+        }
         self.take_pin(section, &pin);
         let mut part = Entry::default().set("kind", kind).set("axis", axis).set("uart_pin", pin.to_string());
         if let Some(tx) = self.pin(section, "tx_pin")?.filter(|pin| self.is_real(pin)) {
@@ -62,10 +66,6 @@ impl Translator<'_> {
         if kind == "tmc2209" {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
             part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
-        }
-        if section.text("select_pins").is_some() {
-            self.note(section, "is behind a multiplexer, which is not simulated", "its driver does not answer");
-            return Ok(());
         }
         self.out.add("part", part);
         Ok(())
