@@ -6,6 +6,7 @@
 mod blocks;
 mod dictionary;
 mod printer;
+mod printer_config;
 mod trace;
 
 use std::cell::Cell;
@@ -30,6 +31,7 @@ const TARGETS: &[Target] = &[
     ("link", link),
     ("printer", printer::run),
     ("printer_cfg", pinion::cli::fuzz::printer_cfg),
+    ("printer_config", printer_config::run),
     ("search", pinion_runtime::fuzz::search),
     ("sources", pinion_runtime::klippy::sources::fuzz),
     ("status", pinion::cli::fuzz::status),

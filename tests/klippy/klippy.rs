@@ -15,7 +15,7 @@ use nix::unistd::geteuid;
 use pinion_linux::clock::Monotonic;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
-use pinion_sim::{SimBoard, SimConfig, SimProbe};
+use pinion_sim::{SimBoard, SimConfig, SimProbe, SimWorld};
 use pinion_testkit::simulator;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -41,7 +41,7 @@ enum Server {
     /// The program.
     Program(Child),
     /// This process, which can read its simulated printer.
-    Here { running: Option<JoinHandle<()>>, probe: SimProbe, _alone: MutexGuard<'static, ()> },
+    Here { running: Vec<JoinHandle<()>>, probe: SimProbe, _alone: MutexGuard<'static, ()> },
 }
 
 /// This process serves one printer at a time: the signal that ends one printer would end all.
@@ -149,8 +149,7 @@ impl Printer {
             let clock = Monotonic::start();
             let config =
                 SimConfig::parse(&fs::read_to_string(folder.join("board.toml")).unwrap(), "board.toml").unwrap();
-            let board = SimBoard::new(config, Arc::new(clock)).unwrap();
-            let (probe, timing) = (board.probe(), board.timing());
+            let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock)).unwrap();
             let options = Options {
                 link: link(folder),
                 access: Access { mode: 0o660, group: None },
@@ -162,11 +161,23 @@ impl Printer {
                 sockets: Vec::new(),
                 dialect: None,
             };
-            let recording = Recording::new(clock, &folder.join("tty"), true, Vec::new()).unwrap();
-            let run = move || {
-                pinion_runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {}).unwrap()
+            let serve = |(place, board): (usize, SimBoard)| {
+                // The first board has the link of the test.
+                let path = match place {
+                    0 => folder.join("tty"),
+                    _ => folder.join(format!("tty_{}", board.name())),
+                };
+                let recording = Recording::new(clock, &path, true, Vec::new()).unwrap();
+                let link = if place == 0 { options.link.clone() } else { LinkName::Pty(path) };
+                let options = Options { link, ..options.clone() };
+                thread::spawn(move || {
+                    let timing = board.timing();
+                    pinion_runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {})
+                        .unwrap();
+                })
             };
-            Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
+            let running = boards.into_iter().enumerate().map(serve).collect();
+            Server::Here { running, probe, _alone: alone }
         });
         printer.until_state("ready");
         printer
@@ -591,7 +602,7 @@ impl Drop for Printer {
             // It handles the signal. The signal ends the printer and not this process.
             Server::Here { running, .. } => {
                 let _ = raise(Signal::SIGTERM);
-                let _ = running.take().map(JoinHandle::join);
+                running.drain(..).for_each(|board| drop(board.join()));
             }
         }
     }

@@ -8,10 +8,12 @@
 mod drivers;
 mod filament;
 mod hosts;
+mod kinematics;
 mod klippy;
 mod leveling;
 mod links;
 mod mainsail;
+mod own_printer;
 mod print;
 mod printer_cfg;
 mod probes;

@@ -15,6 +15,7 @@ mod hostile;
 mod life;
 mod links;
 mod one_order;
+mod own_printer;
 mod preinst;
 mod process;
 mod recorder;

@@ -16,13 +16,17 @@ const DESCRIPTION_MIB: u64 = 1;
 /// Reads a description.
 pub(crate) fn read(file: Option<&Path>) -> Result<SimConfig, Trouble> {
     let Some(path) = file else { return Ok(SimConfig::default_printer()) };
+    SimConfig::parse(&text(path)?, &path.display().to_string())
+}
+
+/// The text of a description.
+pub(crate) fn text(path: &Path) -> Result<String, Trouble> {
     let unreadable = |cause: String| {
         let trouble = Trouble::new(cause).of(path.display());
         trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
     };
     let bytes = files::read(path, DESCRIPTION_MIB).map_err(|error| unreadable(error.to_string()))?;
-    let text = String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))?;
-    SimConfig::parse(&text, &path.display().to_string())
+    String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))
 }
 
 /// Makes the board of a description, for the commands of `pinion` ([`pinion::cli::simulator::Open`]).

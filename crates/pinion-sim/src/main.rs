@@ -19,9 +19,12 @@ use pinion::cli::run::{self, RunArgs};
 use pinion::cli::{LogArgs, completions, logging};
 use printer::SimArgs;
 
+mod attempt;
+mod boards;
 mod camera;
 mod demo;
 mod description;
+mod own;
 mod own_status;
 mod printer;
 mod show;

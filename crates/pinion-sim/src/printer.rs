@@ -21,14 +21,19 @@ use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
-use pinion_linux::sys;
+use pinion_printer_config::Trouble;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
-use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
-use pinion_trace::folder::folders;
+use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
+use crate::attempt::{self, Attempt};
+use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
 use crate::description::read;
+use crate::own;
+use crate::own::args::OwnArgs;
+use crate::own::run::{Place, is_printer_cfg};
+use crate::own::serve::Own;
 use crate::own_status::OwnStatus;
 use crate::show::Show;
 use crate::toolpath::{Files, PathArgs, PathRecord};
@@ -39,13 +44,16 @@ use pinion::cli::{failed, logging};
 /// Options of `pinion-sim`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct SimArgs {
-    /// The printer's description; the built-in printer if left out
-    #[arg(value_name = "FILE.toml")]
+    /// Somebody's printer.cfg, or a description of a printer (.toml); the built-in printer if left out
+    #[arg(value_name = "FILE")]
     file: Option<PathBuf>,
+    #[command(flatten)]
+    own: OwnArgs,
     /// Print the printer.cfg that matches the printer, and end
     #[arg(long)]
     print_config: bool,
-    /// Print the description of the built-in printer, and end. Start from it to write your own
+    /// Print the description of the built-in printer, or of the one in printer.cfg, and end. Start from it to write
+    /// your own
     #[arg(long, conflicts_with = "print_config")]
     print_board: bool,
     /// End after the demonstration. The exit status is 0 if everything in it was right
@@ -71,52 +79,93 @@ pub(crate) struct SimArgs {
     /// Let the flight recorder note each edge of each output, for `pinion trace --vcd`
     #[arg(long)]
     trace_edges: bool,
-    /// Path of the symbolic link that the host opens; it leads to the pty
-    #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
-    symlink: PathBuf,
+    /// Path of the symbolic link that the host opens; it leads to the pty. /tmp/klipper_host_mcu by default; with a
+    /// printer.cfg, a place in the folder with klippy's copy
+    #[arg(short = 'I', value_name = "PATH")]
+    symlink: Option<PathBuf>,
+}
+
+/// The link of the main MCU if the command line names none.
+const LINK: &str = "/tmp/klipper_host_mcu";
+
+/// Somebody's printer while it is served.
+struct Owner {
+    own: Own,
+    place: Place,
+    printer_cfg: PathBuf,
+    attempt: Option<Attempt>,
+}
+
+impl Owner {
+    fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
+        let attempt = args.own.attempt(args.realtime)?;
+        let place = Place::make(&own, &args.own, args.symlink.as_deref())?;
+        Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
+    }
 }
 
 /// Shows the printer at work and continues to serve it, or prints its configuration.
 pub(crate) fn run(args: &SimArgs) -> ExitCode {
-    let config = match read(args.file.as_deref()) {
+    let own = match args.file.as_deref().filter(|file| is_printer_cfg(file)) {
+        Some(file) => match own::run::read(file, &args.own) {
+            Ok(own) => Some(own),
+            Err(error) => return failed(error),
+        },
+        None if args.own.is_used() => {
+            return failed("--try, --with, --folder and --in-place-pty need a printer.cfg: name yours before them");
+        }
+        None => None,
+    };
+    let config = match own.as_ref().map_or_else(|| read(args.file.as_deref()), |own| Ok(own.sim.clone())) {
         Ok(config) => config,
         Err(error) => return failed(error),
     };
     if args.print_board {
-        return print(&Page::text(SimConfig::default_toml())).map_or_else(failed, |()| ExitCode::SUCCESS);
+        let description = own.as_ref().map_or(SimConfig::default_toml(), |own| &own.description);
+        return print(&Page::text(description)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     if args.print_config {
-        let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
+        if own.is_some() {
+            return failed("--print-config needs a description: klippy gets a copy of your printer.cfg");
+        }
+        let printer_cfg = printer_cfg(&config, &args.symlink.as_deref().unwrap_or(Path::new(LINK)).to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     let Checked { path, spi_trace } = match Checked::check(args) {
         Ok(checked) => checked,
         Err(error) => return failed(error),
     };
+    let owner = match own.map(|own| Owner::new(args, own)).transpose() {
+        Ok(owner) => owner,
+        Err(error) => return failed(error),
+    };
+    let links = match &owner {
+        Some(owner) => owner.place.links(&owner.own, args.symlink.as_deref()),
+        None => boards::links(args.symlink.as_deref().unwrap_or(Path::new(LINK)), &config),
+    };
+    let symlink = links[0].clone();
     let clock = Monotonic::start();
-    let recording = Recording::new(clock, &args.symlink, args.realtime, folders());
-    let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true, sys::SERVE)?, recording)));
-    let (helpers, recording) = match helpers {
+    let mut started = match boards::start(&links, clock, args.realtime) {
         Ok(started) => started,
         Err(error) => return failed(error),
     };
+    let (_, recording, helpers) = started.remove(0);
     logging::detach();
     let camera = match args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose() {
         Ok(camera) => camera,
         Err(error) => return failed(error),
     };
     let plan = plan(&config);
-    let board = match SimBoard::new(config, Arc::new(clock)) {
-        Ok(board) => board,
+    let SimWorld { mut boards, probe } = match SimWorld::new(config, Arc::new(clock)) {
+        Ok(world) => world,
         Err(error) => return failed(error),
     };
-    let probe = board.probe();
-    let sockets = pinion_runtime::socket_paths(&args.symlink);
-    let own =
-        match (args.show || camera.is_some()).then(|| OwnStatus::start(sockets.clone(), &args.symlink)).transpose() {
-            Ok(own) => own.unwrap_or_default(),
-            Err(error) => return failed(format!("the printer cannot be shown: {error}")),
-        };
+    let board = boards.remove(0);
+    let sockets = pinion_runtime::socket_paths(&symlink);
+    let own = match (args.show || camera.is_some()).then(|| OwnStatus::start(sockets.clone(), &symlink)).transpose() {
+        Ok(own) => own.unwrap_or_default(),
+        Err(error) => return failed(format!("the printer cannot be shown: {error}")),
+    };
     if let Some(Err(error)) = camera.map(|camera| camera.start(probe.clone(), own.clone())) {
         return failed(error);
     }
@@ -125,7 +174,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(format!("the path cannot be recorded: {error}")),
     };
     let options = Options {
-        link: LinkName::Pty(args.symlink.clone()),
+        link: LinkName::Pty(symlink.clone()),
         dialect: None,
         access: Access { mode: 0o660, group: None },
         realtime: args.realtime,
@@ -135,8 +184,14 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         trace_edges: args.trace_edges,
         sockets,
     };
-    if args.show || path.is_some() || spi_trace.is_some() {
-        return serve(args, board, (probe, own), &options, (recording, helpers), (path, spi_trace));
+    let several = !boards.is_empty();
+    let others = match Others::serve(boards, started, &options) {
+        Ok(others) => others,
+        Err(error) => return failed(error),
+    };
+    if owner.is_some() || args.show || path.is_some() || spi_trace.is_some() || several {
+        let served = serve(args, board, (probe, own), &options, (recording, helpers), (path, spi_trace), owner);
+        return if others.end() { served } else { ExitCode::FAILURE };
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set when the program is asked to end. A demonstration that this interrupts has not failed.
@@ -147,12 +202,12 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         }
     }
     let ready = {
-        let (args, right) = (args.clone(), right.clone());
+        let (args, right, symlink) = (args.clone(), right.clone(), symlink.clone());
         move || {
             let demo = thread::Builder::new().name("demo".into()).spawn(move || {
                 // The link's thread starts it, and passes its real-time priority on.
                 realtime::leave();
-                show(&args, &plan, &probe, (&right, &ended));
+                show((&args, &symlink), &plan, &probe, (&right, &ended));
             });
             if let Err(trouble) = pinion_runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
@@ -189,10 +244,17 @@ fn serve(
     options: &Options,
     (recording, helpers): (Recording, Helpers),
     (path, spi_trace): (Option<PathRecord>, Option<Output>),
+    owner: Option<Owner>,
 ) -> ExitCode {
+    let right = Arc::new(AtomicBool::new(owner.as_ref().is_none_or(|owner| owner.attempt.is_none())));
+    let owner = owner.map(Arc::new);
     let show = match args.show.then(|| Show::prepare(probe.clone(), own)).transpose() {
         Ok(show) => show,
         Err(error) => return failed(format!("the printer cannot be shown: {error}")),
+    };
+    let link = match &options.link {
+        LinkName::Pty(link) => link.clone(),
+        _ => PathBuf::new(),
     };
     // A start that fails makes no file.
     let mut started = false;
@@ -203,8 +265,12 @@ fn serve(
             Ok(trace) => trace.into_iter().for_each(|file| probe.record_spi(file)),
             Err(error) => log::error!("{error}"),
         }
-        if io::stdout().is_terminal() {
-            tell_how_to_connect(args, if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
+        match &owner {
+            Some(owner) => begin(args, owner, &probe, &right),
+            None if io::stdout().is_terminal() => {
+                tell_how_to_connect((args, &link), if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
+            }
+            None => {}
         }
         if let Some(show) = &show {
             show.begin();
@@ -212,6 +278,9 @@ fn serve(
     };
     let timing = board.timing();
     let ended = pinion_runtime::run(options, Box::new(board), timing, recording, helpers, ready);
+    if !right.load(Ordering::SeqCst) && ended.is_ok() {
+        return ExitCode::FAILURE;
+    }
     if let Some(show) = show {
         show.end();
     }
@@ -219,33 +288,63 @@ fn serve(
     ended.map_or_else(failed, |()| written)
 }
 
+/// Says how to start klippy on somebody's printer, or tries the printer and ends the program.
+fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<AtomicBool>) {
+    let (Some(attempt), Place::Folder(_)) = (&owner.attempt, &owner.place) else {
+        owner.place.next(&args.own).iter().for_each(tell);
+        return;
+    };
+    let ended = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
+            log::error!("signals cannot be taken in: {error}");
+        }
+    }
+    let (owner, probe, right, attempt) = (owner.clone(), probe.clone(), right.clone(), attempt.clone());
+    let thread = thread::Builder::new().name("try".into()).spawn(move || {
+        // The link's thread starts it, and passes its real-time priority on.
+        realtime::leave();
+        if let Place::Folder(folder) = &owner.place {
+            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, &ended);
+            right.store(passed, Ordering::SeqCst);
+        }
+        end();
+    });
+    if let Err(trouble) = pinion_runtime::started(thread) {
+        log::error!("the printer cannot be tried: {trouble}");
+    }
+}
+
+/// Ends this program in order, as by Ctrl-C.
+fn end() {
+    if let Err(error) = kill(getpid(), Signal::SIGTERM) {
+        log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
+    }
+}
+
 /// Shows the printer at work, then ends the program or says how to use it with klippy.
-fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, (right, ended): (&AtomicBool, &AtomicBool)) {
-    match demonstration(args, plan, probe) {
+fn show((args, link): (&SimArgs, &Path), plan: &Plan, probe: &SimProbe, (right, ended): (&AtomicBool, &AtomicBool)) {
+    match demonstration(link, plan, probe) {
         Err(_) if ended.load(Ordering::SeqCst) => return,
         Ok(all_right) => right.store(all_right, Ordering::SeqCst),
         Err(error) => log::error!("the demonstration: {error}"),
     }
     if args.demo {
-        // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
-        if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-            log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
-        }
-        return;
+        return end();
     }
-    tell_how_to_connect(args, "Ctrl-C");
+    tell_how_to_connect((args, link), "Ctrl-C");
 }
 
-fn tell_how_to_connect(args: &SimArgs, end: &str) {
+fn tell_how_to_connect((args, link): (&SimArgs, &Path), end: &str) {
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
     tell("");
     tell(format_args!("The simulated printer goes on until {end}. To connect a Klipper host:"));
-    tell(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", args.symlink.display()));
+    tell(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", link.display()));
     tell("  klippy.py printer.cfg");
 }
 
-fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
-    let mut client = Client::connect(&args.symlink, Duration::from_secs(5)).map_err(|error| error.to_string())?;
+fn demonstration(link: &Path, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
+    let mut client = Client::connect(link, Duration::from_secs(5)).map_err(|error| error.to_string())?;
     let report = demonstrate(&mut client, plan, &mut ProgressLines::stdout()).map_err(|error| error.to_string())?;
     // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
@@ -316,7 +415,7 @@ fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
     Some(HeaterPlan {
         name: heater.name.clone(),
         heater: pin(heater.pin.as_ref()?),
-        sensor: heater.sensor_pin.name.clone(),
+        sensor: heater.sensor_pin.as_ref()?.name.clone(),
         thermistor: heater.thermistor().ok()?,
         min_c: heater.min_celsius,
         max_c: heater.max_celsius,

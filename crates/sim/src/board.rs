@@ -10,23 +10,24 @@ use pinion_firmware::board::{
     PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
-use pinion_firmware::time::{TimeSource, Timing};
+use pinion_firmware::time::{Ticks, TimeSource, Timing};
 
 use super::config::SimConfig;
+use super::description::axes::AxisConfig;
+use super::description::boards::{Boards, ConstantValue, McuConfig};
 use super::description::check::Trouble;
-use super::description::pin::PinName;
-use super::description::printer::Kinematics;
-use super::engine::bed::Bed;
+use super::description::pin::{PinName, on_board};
+use super::engine::assemble::assemble;
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
-use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::engine::physics::{Fan, Heater, Lamp, Switch};
 use super::engine::serial::{SerialDevice, SerialWire};
 use super::engine::spi::{MISO, SpiBus, SpiDevice};
-use super::engine::time::{LATE_LIMIT, PrinterTime};
+use super::engine::time::{Drift, LATE_LIMIT, PrinterTime};
 use super::engine::wire::{
-    ControllerPin, DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges,
-    SimLine, SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
+    ControllerPin, DirectionPin, EnablePin, EndstopPin, FanPin, FixedAnalog, FixedInput, FreePin, HeaterPin, Kind,
+    LampPin, SimAdc, SimEdges, SimLine, SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
 };
 use super::engine::world::World;
 use super::part::workshop::Workshop;
@@ -41,26 +42,43 @@ const PWM_WORKER: &str = "pwm";
 /// Highest number of bytes that an SPI bus sends without a pause, as with the kernel's default `spidev.bufsiz`.
 const MESSAGE_MAX: usize = 4096;
 
-/// A simulated printer.
+/// A simulated printer with its boards.
+pub struct SimWorld {
+    /// The boards, in the description's order.
+    pub boards: Vec<SimBoard>,
+    /// A view of the printer for demonstrations, drawings and tests.
+    pub probe: SimProbe,
+}
+
+/// A board of a simulated printer.
 pub struct SimBoard {
+    name: String,
+    constants: Vec<(String, serde_json::Value)>,
     clock: Arc<dyn TimeSource>,
     /// The time of its pins, and of the MCU that drives them.
     time: Arc<PrinterTime>,
     seed: u64,
     world: Arc<World>,
-    bed: Arc<Bed>,
+    probe: SimProbe,
     /// By pin number.
     pins: Vec<WiredPin>,
     /// By number.
     spi_buses: Vec<Arc<SpiBus>>,
     /// By number.
     i2c_buses: Vec<Arc<I2cBus>>,
+    /// Buses on lines, each with the names of its lines.
+    soft_spi: Vec<([String; 3], Arc<SpiBus>)>,
+    soft_i2c: Vec<([String; 2], Arc<I2cBus>)>,
     serial_wires: Vec<Arc<SerialWire>>,
 }
 
-impl SimBoard {
+impl SimWorld {
     /// The printer of a description, in its initial state.
-    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, Trouble> {
+    ///
+    /// # Errors
+    ///
+    /// The first wrong value of the description.
+    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimWorld, Trouble> {
         config.validate()?;
         let printer = config.printer();
         let now = clock.now();
@@ -72,26 +90,36 @@ impl SimBoard {
             spi_buses: Vec::new(),
             i2c_buses: config.i2c_buses.iter().map(I2cBus::new).collect(),
             serial_wires: Vec::new(),
+            uarts: Vec::new(),
         };
-        let belts =
-            (printer.kinematics() == Kinematics::CoreXy).then(|| Some([printer.axis("x")?, printer.axis("y")?]));
-        let mut belts: Vec<Axis> = belts.flatten().map_or(Vec::new(), |axes| Axis::belts(axes).into());
-        for part in &config.axes {
-            let on_belts = belts.iter().position(|axis| axis.name == part.name);
-            let axis = Arc::new(on_belts.map_or_else(|| Axis::new(part), |place| belts.swap_remove(place)));
+        (workshop.world.axes, workshop.world.carriages) = assemble(&printer)?;
+        for (part, axis) in config.axes.iter().zip(workshop.world.axes.clone()) {
             workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
             workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));
-            workshop.wire(part.enable_pin.as_ref(), EnablePin(axis.clone()));
-            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.clone()));
-            workshop.world.axes.push(axis);
+            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.rail().clone()));
+        }
+        let boards = Boards(&config.mcus);
+        let line = |pin: &PinName| (boards.of(&pin.name), local(&pin.name));
+        for (place, part) in config.axes.iter().enumerate() {
+            let Some(pin) = &part.enable_pin else { continue };
+            let shares = |other: &AxisConfig| other.enable_pin.as_ref().is_some_and(|other| line(other) == line(pin));
+            if config.axes[..place].iter().any(shares) {
+                continue;
+            }
+            let motors = config.axes.iter().zip(&workshop.world.axes).filter(|(other, _)| shares(other));
+            let motors = motors.map(|(_, axis)| axis.clone()).collect();
+            workshop.wire(Some(pin), EnablePin(motors));
+        }
+        for (part, rail) in config.carriages.iter().zip(workshop.world.carriages.clone()) {
+            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(rail));
         }
         let extruders = printer.hot_ends().filter_map(|hot_end| workshop.axis(&hot_end.name));
         workshop.world.extruders = extruders.collect();
         for part in &config.heaters {
             let cooling_w_per_k = printer.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
-            let heater = Arc::new(Heater::new(part, part.thermistor()?, cooling_w_per_k, now));
+            let heater = Arc::new(Heater::new(part, part.sensor()?, cooling_w_per_k, now));
             workshop.wire(part.pin.as_ref(), HeaterPin(heater.clone()));
-            workshop.wire(Some(&part.sensor_pin), ThermistorPin(heater.clone()));
+            workshop.wire(part.sensor_pin.as_ref(), ThermistorPin(heater.clone()));
             workshop.world.heaters.push(heater);
         }
         for part in &config.fans {
@@ -123,6 +151,9 @@ impl SimBoard {
         for part in &config.inputs {
             workshop.wire(Some(&part.pin), FixedInput { name: part.name.clone(), on: part.level });
         }
+        for part in &config.analogs {
+            workshop.wire(Some(&part.pin), FixedAnalog { name: part.name.clone(), fraction: part.fraction });
+        }
         for bus in &config.spi_buses {
             let bus = SpiBus::new(bus, |name| {
                 let (pin, lamp) = switched.iter().find(|(pin, _)| pin.name == name)?;
@@ -134,37 +165,120 @@ impl SimBoard {
             part.part().build(&mut workshop)?;
         }
         for bus in &config.spi_buses {
-            workshop.wire(Some(&bus.mosi_pin()), ControllerPin { kind: Kind::Mosi, of: bus.name.clone() });
+            let line = |kind| ControllerPin { kind, of: bus.name.clone() };
+            match bus.lines() {
+                None => workshop.wire(Some(&bus.output_pin()), line(Kind::Mosi)),
+                Some([miso, mosi, sclk]) => {
+                    workshop.wire(Some(miso), line(Kind::Free));
+                    workshop.wire(Some(mosi).filter(|mosi| mosi.name != miso.name), line(Kind::Free));
+                    workshop.wire(Some(sclk), line(Kind::Free));
+                }
+            }
+        }
+        for bus in &config.i2c_buses {
+            for pin in bus.lines().into_iter().flatten() {
+                workshop.wire(Some(pin), ControllerPin { kind: Kind::Free, of: bus.name.clone() });
+            }
+        }
+        for pin in config.mcus.iter().map(McuConfig::free_pins) {
+            pin?.iter().for_each(|pin| workshop.wire(Some(pin), FreePin));
         }
         let bed = Arc::new(workshop.bed());
         let Workshop { world, pins, spi_buses, i2c_buses, serial_wires, .. } = workshop;
-        Ok(SimBoard {
-            time: Arc::new(PrinterTime::new(clock.clone())),
-            clock,
-            seed: config.seed,
-            world: Arc::new(world),
-            bed,
+        let spi_buses: Vec<_> = spi_buses.into_iter().map(Arc::new).collect();
+        let settles = if config.mcus.len() > 1 { LATE_LIMIT } else { Ticks(0) };
+        let world = Arc::new(world);
+        let probe = SimProbe { world, bed, spi_buses, clock, settles };
+        let parts = Parts {
             pins,
-            spi_buses: spi_buses.into_iter().map(Arc::new).collect(),
             i2c_buses: i2c_buses.into_iter().map(Arc::new).collect(),
             serial_wires: serial_wires.into_iter().map(Arc::new).collect(),
-        })
+        };
+        let count = config.mcus.len().max(1);
+        let boards = (0..count).map(|number| SimBoard::of(number, &config, &parts, &probe)).collect();
+        Ok(SimWorld { boards, probe })
+    }
+}
+
+/// What is connected to the boards.
+struct Parts {
+    pins: Vec<WiredPin>,
+    i2c_buses: Vec<Arc<I2cBus>>,
+    serial_wires: Vec<Arc<SerialWire>>,
+}
+
+impl SimBoard {
+    /// The only board of a description, in the printer's initial state.
+    ///
+    /// # Errors
+    ///
+    /// The first wrong value of the description, or there are several boards.
+    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, Trouble> {
+        let mut boards = SimWorld::new(config, clock)?.boards;
+        match (boards.pop(), boards.is_empty()) {
+            (Some(board), true) => Ok(board),
+            _ => Err(Trouble::new("the simulated printer has several boards").remedy("serve it with `pinion sim`")),
+        }
+    }
+
+    /// The board with this number.
+    fn of(number: usize, config: &SimConfig, parts: &Parts, probe: &SimProbe) -> SimBoard {
+        let boards = Boards(&config.mcus);
+        let is_here = |name: &str| boards.of(name) == Some(number);
+        let local = |pin: &PinName| on_board(&pin.name).1.to_owned();
+        let mcu = config.mcus.get(number);
+        let clock = probe.clock.clone();
+        let drift = Drift::of(mcu.map_or(0.0, |mcu| mcu.drift_ppm));
+        let mut board = SimBoard {
+            name: mcu.map_or_else(|| "mcu".to_owned(), |mcu| mcu.name.clone()),
+            constants: mcu.map_or_else(Vec::new, constants),
+            time: Arc::new(PrinterTime::new(clock.clone(), drift)),
+            clock,
+            seed: config.seed,
+            world: probe.world.clone(),
+            probe: probe.clone(),
+            pins: parts.pins.iter().filter(|pin| is_here(&pin.name)).cloned().map(WiredPin::on_its_board).collect(),
+            spi_buses: Vec::new(),
+            i2c_buses: Vec::new(),
+            soft_spi: Vec::new(),
+            soft_i2c: Vec::new(),
+            serial_wires: parts.serial_wires.iter().filter(|wire| is_here(&wire.name)).cloned().collect(),
+        };
+        for (described, bus) in config.spi_buses.iter().zip(&probe.spi_buses) {
+            match described.lines() {
+                Some(lines) if is_here(&lines[2].name) => board.soft_spi.push((lines.map(local), bus.clone())),
+                None if is_here(&bus.name) => board.spi_buses.push(bus.clone()),
+                _ => {}
+            }
+        }
+        for (described, bus) in config.i2c_buses.iter().zip(&parts.i2c_buses) {
+            match described.lines() {
+                Some(lines) if is_here(&lines[0].name) => board.soft_i2c.push((lines.map(local), bus.clone())),
+                None if is_here(&bus.name) => board.i2c_buses.push(bus.clone()),
+                _ => {}
+            }
+        }
+        board
+    }
+
+    /// Its name in printer.cfg, for example `toolhead`.
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// A view of the printer for demonstrations, drawings and tests.
     pub fn probe(&self) -> SimProbe {
-        SimProbe {
-            world: self.world.clone(),
-            bed: self.bed.clone(),
-            spi_buses: self.spi_buses.clone(),
-            clock: self.clock.clone(),
-        }
+        self.probe.clone()
     }
 
     /// The time of the MCU that drives the printer.
     pub fn timing(&self) -> Timing {
         let due = self.time.due();
         Timing { clock: self.time.clone(), due, late_limit: LATE_LIMIT, step_late_limit: LATE_LIMIT }
+    }
+
+    fn pin_name(&self, pin: Pin) -> String {
+        self.pin(pin, reason::NOT_OUTPUT).map_or_else(|_| String::new(), |wired| wired.name.clone())
     }
 
     fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
@@ -174,6 +288,21 @@ impl SimBoard {
                 .remedy(format!("name one of its {count} pins (pinion sim --print-config shows them)"))
         })
     }
+}
+
+/// The constants of a board's dictionary.
+fn constants(mcu: &McuConfig) -> Vec<(String, serde_json::Value)> {
+    let value = |value: &ConstantValue| match value {
+        ConstantValue::Number(number) => (*number).into(),
+        ConstantValue::Text(text) => text.as_str().into(),
+    };
+    let chip = ("MCU".to_owned(), mcu.chip.as_str().into());
+    std::iter::once(chip).chain(mcu.constants.iter().map(|(name, constant)| (name.clone(), value(constant)))).collect()
+}
+
+/// The name of a pin or a bus on its board.
+fn local(name: &str) -> String {
+    on_board(name).1.to_owned()
 }
 
 /// The bus with this number, or an error.
@@ -214,8 +343,31 @@ impl Board for SimBoard {
         (0..).zip(&self.pins).map(range).collect()
     }
 
+    fn constants(&self) -> Vec<(String, serde_json::Value)> {
+        self.constants.clone()
+    }
+
+    fn spi_on_lines(&mut self, pins: [Pin; 3], config: &SpiConfig) -> Option<OnWorker<dyn BusDevice>> {
+        let names = pins.map(|pin| self.pin_name(pin));
+        let (_, bus) = self.soft_spi.iter().find(|(lines, _)| *lines == names)?;
+        let device = SpiDevice {
+            bus: bus.clone(),
+            mode: config.mode,
+            rate_hz: config.rate_hz,
+            chip_select: config.chip_select.clone(),
+        };
+        Some(OnWorker { bus: bus.name.clone(), device: Box::new(device) })
+    }
+
+    fn i2c_on_lines(&mut self, pins: [Pin; 2], config: I2cConfig) -> Option<OnWorker<dyn BusDevice>> {
+        let names = pins.map(|pin| self.pin_name(pin));
+        let (_, bus) = self.soft_i2c.iter().find(|(lines, _)| *lines == names)?;
+        let device = I2cDevice { bus: bus.clone(), address: config.address };
+        Some(OnWorker { bus: bus.name.clone(), device: Box::new(device) })
+    }
+
     fn spi_buses(&self) -> Vec<Range> {
-        let range = |(first, bus): (u32, &Arc<SpiBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        let range = |(first, bus): (u32, &Arc<SpiBus>)| Range { name: local(&bus.name), first, count: 1 };
         (0..).zip(&self.spi_buses).map(range).collect()
     }
 
@@ -241,7 +393,7 @@ impl Board for SimBoard {
 
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let wired = self.pin(pin, reason::ADC_OPEN)?;
-        if wired.wire.kind() != Kind::Analog {
+        if !matches!(wired.wire.kind(), Kind::Analog | Kind::Free) {
             return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
         }
         let noise = Noise::of(&wired.name, self.seed);
@@ -250,7 +402,7 @@ impl Board for SimBoard {
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
-        let range = |(first, bus): (u32, &Arc<I2cBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        let range = |(first, bus): (u32, &Arc<I2cBus>)| Range { name: local(&bus.name), first, count: 1 };
         (0..).zip(&self.i2c_buses).map(range).collect()
     }
 
@@ -262,10 +414,7 @@ impl Board for SimBoard {
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         let wired = self.pin(config.pin, reason::PWM_CONFIG)?;
-        if wired.wire.kind() != Kind::Pwm {
-            return Err(wired.is_no("hardware PWM channel", reason::PWM_CONFIG));
-        }
-        let mut pwm = SimPwm(wired.wire.clone());
+        let mut pwm = SimPwm { pin: wired.clone(), clock: self.clock.clone() };
         pwm.set(config.value)?;
         Ok(OnWorker { bus: PWM_WORKER.to_owned(), device: Box::new(pwm) })
     }
@@ -304,7 +453,7 @@ impl Board for SimBoard {
     fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
         // Another error names a pin that is not there.
         let Ok(wired) = self.pin(pin, reason::SERIAL_OPEN) else { return Ok(None) };
-        let is_it = |wire: &&Arc<SerialWire>| wired.wire.kind() == Kind::Serial && wire.name == wired.name;
+        let is_it = |wire: &&Arc<SerialWire>| wired.wire.kind() == Kind::Serial && local(&wire.name) == wired.name;
         let Some(wire) = self.serial_wires.iter().find(is_it) else { return Ok(None) };
         let (wire, clock) = (wire.clone(), self.clock.clone());
         let bus = wire.name.clone();

@@ -3,16 +3,16 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::part::workshop::Part;
 use super::part::{
-    ads1220, adxl345, angle, apa102, bltouch, ds18b20, hx71x, ldc1612, loopback, probe, pwm_channel, servo, spool,
-    ssd1306, thermocouple, tmc2209, tmc5160, ws2812,
+    ads1220, adxl345, angle, apa102, bltouch, ds18b20, hx71x, i2c_register, i2c_sensor, ldc1612, loopback, probe,
+    pwm_channel, servo, spi_dac, spool, ssd1306, thermocouple, tmc2209, tmc2660, tmc5160, ws2812,
 };
 
 /// A part in the description: a `[[part]]`. Its key `kind` selects one of these.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum PartConfig {
     /// An accelerometer.
@@ -33,6 +33,23 @@ pub enum PartConfig {
     Angle(angle::AngleConfig),
     /// A stepper driver on a UART.
     Tmc2209(tmc2209::Tmc2209Config),
+    /// A stepper driver on a UART, without an address.
+    Tmc2208(tmc2209::Tmc2208Config),
+    /// A stepper driver.
+    Tmc2660(tmc2660::Tmc2660Config),
+    /// A thermometer on I2C.
+    #[serde(rename = "i2c_sensor")]
+    I2cSensor(i2c_sensor::I2cSensorConfig),
+    /// A chip on I2C that takes values.
+    #[serde(rename = "i2c_register")]
+    I2cRegister(i2c_register::I2cRegisterConfig),
+    /// A chip on SPI that takes values.
+    #[serde(rename = "spi_dac")]
+    SpiDac(spi_dac::SpiDacConfig),
+    /// A stepper driver.
+    Tmc2130(tmc5160::Tmc2130Config),
+    /// A stepper driver.
+    Tmc2240(tmc5160::Tmc2240Config),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
     /// A strip of lights on an SPI bus's data output.
@@ -67,6 +84,13 @@ impl PartConfig {
             PartConfig::Spool(config) => config,
             PartConfig::Angle(config) => config,
             PartConfig::Tmc2209(config) => config,
+            PartConfig::Tmc2660(config) => config,
+            PartConfig::I2cSensor(config) => config,
+            PartConfig::I2cRegister(config) => config,
+            PartConfig::SpiDac(config) => config,
+            PartConfig::Tmc2208(config) => config,
+            PartConfig::Tmc2130(config) => config,
+            PartConfig::Tmc2240(config) => config,
             PartConfig::Tmc5160(config) => config,
             PartConfig::Ws2812(config) => config,
             PartConfig::Apa102(config) => config,

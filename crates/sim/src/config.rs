@@ -3,31 +3,41 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::catalog::PartConfig;
-use super::description::axes::{AxisConfig, BedConfig, DeltaConfig, Limits};
+use super::description::axes::{AxisConfig, BedConfig, CarriageConfig, DeltaConfig, Limits};
+use super::description::boards::{Boards, McuConfig};
 use super::description::buses::{I2cBusConfig, SpiBusConfig};
 use super::description::check::{Trouble, UsedPins, no_name, wrong};
 use super::description::heater::{FanConfig, HeaterConfig};
-use super::description::outputs::{InputConfig, LedConfig, OutputConfig};
+use super::description::kinematics::KinematicsConfig;
+use super::description::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};
 use super::description::pin::is_word;
 use super::description::printer::Printer;
 use super::part::workshop::{Part, Socket};
 
 /// A simulated printer.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SimConfig {
     /// Seed of the sensors' noise: the same seed gives the same readings.
     #[serde(default)]
     pub seed: u64,
+    /// The boards. Without this there is one, a Linux process.
+    #[serde(default, rename = "mcu", skip_serializing_if = "Vec::is_empty")]
+    pub mcus: Vec<McuConfig>,
     /// The limits of the motion in printer.cfg.
     #[serde(default)]
     pub limits: Limits,
     /// The axes; `x`, `y`, `z` and `extruder` make a cartesian printer.
     #[serde(default, rename = "axis")]
     pub axes: Vec<AxisConfig>,
+    /// Rails without a motor of their own.
+    #[serde(default, rename = "carriage")]
+    pub carriages: Vec<CarriageConfig>,
+    /// How the axes move the head.
+    pub kinematics: Option<KinematicsConfig>,
     /// Whether the motors of x and y drive the two belts of a CoreXY printer.
     #[serde(default)]
     pub corexy: bool,
@@ -48,6 +58,9 @@ pub struct SimConfig {
     /// Inputs that stay at one level: buttons, a door.
     #[serde(default, rename = "input")]
     pub inputs: Vec<InputConfig>,
+    /// Analog pins at a fixed level.
+    #[serde(default, rename = "analog")]
+    pub analogs: Vec<AnalogConfig>,
     /// The shape of the bed.
     #[serde(default)]
     pub bed: BedConfig,
@@ -97,9 +110,31 @@ impl SimConfig {
         Ok(config)
     }
 
-    /// Whether the motor of this axis drives a belt of a CoreXY printer. Alone it homes no axis.
+    /// The description as TOML.
+    ///
+    /// # Errors
+    ///
+    /// A number that TOML cannot hold.
+    pub fn to_toml(&self) -> Result<String, Trouble> {
+        toml::to_string(self).map_err(|error| Trouble::new(error.to_string()).remedy("please report it"))
+    }
+
+    /// The place of an axis, in millimeters or radians, with the nozzle at this place. `None` if the axis does not move the
+    /// nozzle, or the nozzle cannot be there.
+    pub fn axis_place(&self, axis: &str, nozzle_mm: [f64; 3]) -> Option<f64> {
+        let kinematics = self.printer().kinematics();
+        let rail = kinematics.rails().iter().position(|rail| *rail == axis)?;
+        let place = match kinematics.linkage() {
+            Some(linkage) => linkage.places(nozzle_mm)[rail],
+            None => nozzle_mm[rail],
+        };
+        place.is_finite().then_some(place)
+    }
+
+    /// Whether the motor of this axis moves more than the axis, for example a belt of a CoreXY printer. Alone it homes no
+    /// axis.
     pub fn is_on_belts(&self, axis: &str) -> bool {
-        self.corexy && ["x", "y"].contains(&axis)
+        self.printer().shares_belt(axis)
     }
 
     /// The description without its parts.
@@ -108,6 +143,8 @@ impl SimConfig {
             seed: self.seed,
             limits: &self.limits,
             axes: &self.axes,
+            carriages: &self.carriages,
+            chosen: self.kinematics.as_ref(),
             corexy: self.corexy,
             delta: self.delta.as_ref(),
             heaters: &self.heaters,
@@ -115,6 +152,7 @@ impl SimConfig {
             leds: &self.leds,
             outputs: &self.outputs,
             inputs: &self.inputs,
+            analogs: &self.analogs,
             bed: &self.bed,
             spi_buses: &self.spi_buses,
             i2c_buses: &self.i2c_buses,
@@ -128,7 +166,12 @@ impl SimConfig {
     /// The first wrong value, with its key and a remedy.
     pub(super) fn validate(&self) -> Result<(), Trouble> {
         let printer = self.printer();
-        let mut pins = UsedPins::default();
+        let boards = Boards(&self.mcus);
+        boards.validate()?;
+        let mut pins = UsedPins::of(boards);
+        for pin in self.mcus.iter().map(McuConfig::free_pins) {
+            pin?.iter().try_for_each(|pin| pins.claim("[[mcu]]", "pins", Some(pin)))?;
+        }
         printer.validate(&mut pins)?;
         if self.parts.len() > PARTS_MAX {
             let trouble = Trouble::new(format!("there are {} parts", self.parts.len()));
@@ -144,6 +187,7 @@ impl SimConfig {
             return Err(Trouble::new("there are two of it").remedy("remove one, or tell them apart").of(whose));
         }
         part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
+        part.uart_pins().into_iter().try_for_each(|(key, pin)| pins.claim_for(Some("UART"), whose, key, pin))?;
         let socket = part.socket();
         let neighbours = self.parts.iter().map(PartConfig::part).filter(|other| other.name() != part.name());
         let mut neighbours = neighbours.filter_map(Part::socket);

@@ -30,6 +30,10 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     );
     cfg.section("mcu");
     cfg.key("serial", pty);
+    for mcu in config.mcus.iter().skip(1) {
+        cfg.section(format_args!("mcu {}", mcu.name));
+        cfg.key("serial", format_args!("{pty}_{}", mcu.name));
+    }
 
     cfg.section("virtual_sdcard");
     cfg.comment("Kalico's filament sensors need it. Make the folder, or name one that exists:");
@@ -70,14 +74,23 @@ impl Sections {
             match layout.kinematics {
                 Kinematics::Cartesian => "cartesian",
                 Kinematics::CoreXy => "corexy",
+                Kinematics::CoreXz => "corexz",
+                Kinematics::HybridCoreXy => "hybrid_corexy",
+                Kinematics::HybridCoreXz => "hybrid_corexz",
                 Kinematics::Delta(_) => "delta",
-                Kinematics::None => "none",
+                // Their sections are the user's own.
+                Kinematics::Generic
+                | Kinematics::Deltesian(_)
+                | Kinematics::Polar
+                | Kinematics::RotaryDelta(_)
+                | Kinematics::Winch(_)
+                | Kinematics::None => "none",
             },
         );
         self.key("max_velocity", limits.velocity_mm_per_s);
         self.key("max_accel", limits.accel_mm_per_s2);
         match layout.kinematics {
-            Kinematics::Cartesian | Kinematics::CoreXy => {
+            _ if layout.has_rails() => {
                 // klippy refuses a z axis that is faster than the head.
                 self.key("max_z_velocity", limits.z_velocity_mm_per_s.min(limits.velocity_mm_per_s));
                 self.key("max_z_accel", limits.z_accel_mm_per_s2.min(limits.accel_mm_per_s2));
@@ -88,7 +101,7 @@ impl Sections {
                 self.comment("A nozzle that is a probe goes below the bed.");
                 self.key("minimum_z_position", -CLEAR_MM);
             }
-            Kinematics::None => {}
+            _ => {}
         }
         for axis in layout.printer.axes {
             if !layout.is_hot_end(&axis.name) {
@@ -96,14 +109,14 @@ impl Sections {
             }
         }
         match layout.kinematics {
-            Kinematics::Cartesian | Kinematics::CoreXy => self.leveling(layout),
+            _ if layout.has_rails() => self.leveling(layout),
             Kinematics::Delta(delta) => {
                 self.section("delta_calibrate");
                 self.key("radius", rounded(WITHIN_REACH * delta.bed_radius_mm));
                 self.key("horizontal_move_z", CLEAR_MM);
                 self.key("speed", limits.velocity_mm_per_s);
             }
-            Kinematics::None => {}
+            _ => {}
         }
     }
 
@@ -124,7 +137,7 @@ impl Sections {
                 self.rail(axis);
                 if name == "z" {
                     // A nozzle that is a probe moves below the endstop.
-                    self.key("position_min", -axis.overtravel_mm);
+                    self.key("position_min", axis.min_mm - axis.overtravel_mm);
                 }
             }
             // Another motor of an axis. The axis has the other keys.
@@ -186,15 +199,30 @@ impl Sections {
     fn rail(&mut self, axis: &AxisConfig) {
         let travel_mm = axis.travel_mm.unwrap_or(0.0);
         let endstop = match axis.endstop_at {
-            End::Min => 0.0,
+            End::Min => axis.min_mm,
             End::Max => travel_mm,
         };
-        self.key("position_endstop", endstop);
+        self.key("position_endstop", axis.endstop_mm.unwrap_or(endstop));
+        if axis.min_mm != 0.0 && axis.name != "z" {
+            self.key("position_min", axis.min_mm);
+        }
         self.key("position_max", travel_mm);
         self.key("homing_speed", axis.homing_mm_per_s);
     }
 
     fn thermistor(&mut self, heater: &HeaterConfig) {
+        if !heater.points_celsius_fraction.is_empty() {
+            // klippy's reference is 5 V.
+            self.section(format_args!("adc_temperature sim_{}", heater.name));
+            for (i, (celsius, fraction)) in (1..).zip(&heater.points_celsius_fraction) {
+                self.key(format_args!("temperature{i}"), celsius);
+                self.key(format_args!("voltage{i}"), fraction * 5.0);
+            }
+            return;
+        }
+        if heater.sensor_pin.is_none() {
+            return;
+        }
         self.section(format_args!("thermistor sim_{}", heater.name));
         for (i, (celsius, ohm)) in (1..).zip(&heater.points_celsius_ohm) {
             self.key(format_args!("temperature{i}"), celsius);
@@ -232,10 +260,14 @@ impl Sections {
 
     /// The keys of a heater's thermistor.
     fn sensor(&mut self, heater: &HeaterConfig) {
-        self.needs(format_args!("thermistor sim_{}", heater.name));
+        let is_curve = !heater.points_celsius_fraction.is_empty();
+        let kind = if is_curve { "adc_temperature" } else { "thermistor" };
+        self.needs(format_args!("{kind} sim_{}", heater.name));
         self.key("sensor_type", format_args!("sim_{}", heater.name));
-        self.key("sensor_pin", &heater.sensor_pin);
-        self.key("pullup_resistor", heater.pullup_ohm);
+        self.key_if("sensor_pin", heater.sensor_pin.as_ref());
+        if !is_curve {
+            self.key("pullup_resistor", heater.pullup_ohm);
+        }
         self.key("min_temp", heater.min_celsius);
         self.key("max_temp", heater.max_celsius);
     }

@@ -8,12 +8,12 @@ use std::sync::Arc;
 
 use super::engine::bed::{Bed, Space};
 use super::engine::look::Look;
-use super::engine::physics::Axis;
+use super::engine::motion::Rail;
 use super::engine::recorder::Recorder;
 use super::engine::ring::RingWatch;
 use super::engine::spi::SpiBus;
 use super::engine::world::World;
-use pinion_firmware::time::{Clock, TimeSource};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
 
 /// A view of a simulated printer, from any thread, while it runs.
 #[derive(Clone)]
@@ -22,6 +22,8 @@ pub struct SimProbe {
     pub(super) bed: Arc<Bed>,
     pub(super) spi_buses: Vec<Arc<SpiBus>>,
     pub(super) clock: Arc<dyn TimeSource>,
+    /// How long the steps of an instant may still come.
+    pub(super) settles: Ticks,
 }
 
 /// The present state of an axis.
@@ -31,7 +33,9 @@ pub struct AxisView<'a> {
     pub name: &'a str,
     /// Its position. On a CoreXY printer it is the head's place along x or y, and not the motor's.
     pub position_mm: f64,
-    /// The end of its travel from 0; `None` for an axis without an end.
+    /// The lowest place of its travel.
+    pub min_mm: f64,
+    /// The highest place of its travel; `None` for an axis without an end.
     pub travel_mm: Option<f64>,
     /// Whether its motor is held.
     pub enabled: bool,
@@ -87,16 +91,25 @@ impl SimProbe {
         self.clock.now()
     }
 
-    /// The axes, in the description's order.
+    /// The axes, in the description's order, then the carriages that have no motor of their own.
     pub fn axes(&self) -> impl Iterator<Item = AxisView<'_>> {
-        self.world.axes.iter().map(|axis| AxisView {
+        let view = |rail: &'_ Rail| AxisView {
+            name: "",
+            position_mm: rail.position_mm(),
+            min_mm: rail.travel_mm.map_or(0.0, |(min_mm, _)| min_mm),
+            travel_mm: rail.travel_mm.map(|(_, max_mm)| max_mm),
+            enabled: true,
+            endstop: rail.endstop(),
+            lost_steps: 0,
+        };
+        let axes = self.world.axes.iter().map(move |axis| AxisView {
             name: &axis.name,
-            position_mm: axis.position_mm(),
-            travel_mm: axis.travel_mm,
             enabled: axis.is_enabled(),
-            endstop: axis.endstop(),
             lost_steps: axis.lost_steps(),
-        })
+            ..view(axis.rail())
+        });
+        let carriages = self.world.carriages.iter();
+        axes.chain(carriages.map(move |rail| AxisView { name: &rail.name, ..view(rail) }))
     }
 
     /// The heaters at this instant.
@@ -124,23 +137,23 @@ impl SimProbe {
     /// Where the steps have put the nozzle: x, y and z. klippy's place is the same if it has homed, lost no step, and
     /// uses neither a bed mesh nor another transformation.
     pub fn nozzle_mm(&self) -> [f64; 3] {
-        self.bed.head().nozzle_mm(Axis::position_mm)
+        self.bed.head().nozzle_mm(Rail::position_mm)
     }
 
     /// The space that the nozzle can reach, over the bed. It never changes. `None` if an axis is missing or has no end.
     pub fn space(&self) -> Option<Space> {
-        self.bed.head().space()
+        self.bed.space()
     }
 
     /// Records the path of the nozzle from now on.
     pub fn recorder(&self) -> Recorder {
-        Recorder::new(self.bed.clone(), &self.world.extruders, self.now())
+        Recorder::new(self.bed.clone(), &self.world.extruders, self.settles, self.now())
     }
 
     /// Watches what rings on the axes, from now on.
     pub fn rings(&self) -> Vec<RingWatch> {
         let now = self.now();
-        self.world.rings.iter().map(|(axis, config)| RingWatch::new(axis.clone(), config, now)).collect()
+        self.world.rings.iter().map(|(rail, config)| RingWatch::new(rail.clone(), config, now)).collect()
     }
 
     /// A person's view of the other parts at this instant: the part's name, and what it looks like.

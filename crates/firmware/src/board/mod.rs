@@ -456,6 +456,25 @@ pub trait Board: Send {
     /// The names of the dictionary's enumeration `spi_bus`.
     fn spi_buses(&self) -> Vec<Range>;
 
+    /// Constants of the dictionary that differ from Pinion's own, or come in addition. A simulated board says with `MCU`
+    /// which chip it stands for.
+    fn constants(&self) -> Vec<(String, serde_json::Value)> {
+        Vec::new()
+    }
+
+    /// A device on a software bus of these lines (MISO, MOSI, SCLK), if the board has another way to it than its lines.
+    /// The number of the bus has no meaning.
+    fn spi_on_lines(&mut self, pins: [Pin; 3], config: &SpiConfig) -> Option<OnWorker<dyn BusDevice>> {
+        let _ = (pins, config);
+        None
+    }
+
+    /// The same for an I2C device on two lines (SCL, SDA).
+    fn i2c_on_lines(&mut self, pins: [Pin; 2], config: I2cConfig) -> Option<OnWorker<dyn BusDevice>> {
+        let _ = (pins, config);
+        None
+    }
+
     /// Another view of the same hardware, for a thread that [looks again](Board::look_again). This board then also has
     /// what the view finds. `None` if nothing comes or goes.
     fn view(&self) -> Option<Box<dyn Board>> {

@@ -16,7 +16,7 @@ use crate::mcu::{
     response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
-use crate::time::Ticks;
+use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -194,6 +194,12 @@ impl I2c {
     }
 
     fn set_lines(&mut self, context: &mut Context, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
+        let rate_hz = CLOCK_FREQ.checked_div(pulse.0.saturating_mul(2)).unwrap_or(CLOCK_FREQ);
+        let config = I2cConfig { bus: 0, address: seven_bits(address), rate_hz };
+        if let Some(opened) = context.board()?.i2c_on_lines(pins, config) {
+            self.bus = Some(context.bus(opened)?);
+            return Ok(());
+        }
         let [scl, sda] = pins;
         let lines = (context.shared_wire(scl)?, context.shared_wire(sda)?);
         let name = format!("scl {} sda {} address {:#04x}", context.name(scl), context.name(sda), seven_bits(address));

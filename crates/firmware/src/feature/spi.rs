@@ -183,6 +183,12 @@ impl Spi {
 
     fn set_lines(&mut self, context: &mut Context, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
         self.may_have_bus(context, mode)?;
+        let rate_hz = CLOCK_FREQ.checked_div(pulse.0).unwrap_or(CLOCK_FREQ);
+        let config = SpiConfig { bus: 0, mode, rate_hz, chip_select: self.chip_select.clone() };
+        if let Some(opened) = context.board()?.spi_on_lines(pins, &config) {
+            self.bus = Some(context.bus(opened)?);
+            return Ok(());
+        }
         let [miso, mosi, sclk] = pins;
         // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {

@@ -220,6 +220,7 @@ fn publish_names(firmware: &Firmware, name: &DialectName, board: &dyn Board, dic
     if let Some((name, value)) = firmware.wire.rate() {
         dictionary.config.insert(name.into(), json!(value));
     }
+    dictionary.config.extend(board.constants());
     let enumerations = firmware.all(|feature| feature.enumerations);
     let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
     for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {

@@ -13,6 +13,7 @@ use crate::printer_cfg::{Gains, printer_cfg};
 use crate::view::AxisView;
 use std::collections::HashSet;
 
+mod boards;
 mod buses;
 mod examples;
 

@@ -165,8 +165,14 @@ fn the_documentation_has_every_kind_and_every_key() {
         ("[[axis]]", "### `[[axis]]`"),
         ("[[heater]]", "### `[[heater]]`"),
         ("[[fan]]", "### `[[fan]]`"),
-        ("[[led]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
-        ("[[input]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
+        ("[[led]]", "### `[[led]]`, `[[output]]`, `[[input]]`, `[[analog]]`"),
+        ("[[input]]", "### `[[led]]`, `[[output]]`, `[[input]]`, `[[analog]]`"),
+        ("[[analog]]", "### `[[led]]`, `[[output]]`, `[[input]]`, `[[analog]]`"),
+        ("[[mcu]]", "### `[[mcu]]`"),
+        ("[[carriage]]", "### `[[carriage]]`"),
+        ("[kinematics]\nkind = \"deltesian\"", "### `[kinematics]`"),
+        ("[kinematics]\nkind = \"rotary_delta\"", "### `[kinematics]`"),
+        ("[kinematics]\nkind = \"winch\"", "### `[kinematics]`"),
         ("[delta]", "### `[delta]`"),
         ("[bed]", "### `[bed]`"),
         ("[[spi_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
@@ -175,6 +181,9 @@ fn the_documentation_has_every_kind_and_every_key() {
         ("[[part]]\nkind = \"hx71x\"\n[part.cell]", "### hx71x"),
     ] {
         offered(&format!("{table}\nnobody = 1")).iter().for_each(|key| has(heading, key));
+    }
+    for kind in offered("[kinematics]\nkind = \"nobody\"") {
+        has("### `[kinematics]`", &kind);
     }
     let kinds = offered("[[part]]\nkind = \"nobody\"");
     assert!(kinds.len() > 10, "{kinds:?}");
@@ -189,13 +198,12 @@ fn the_documentation_has_every_kind_and_every_key() {
 }
 
 #[test]
-fn corexy_needs_three_homed_axes_with_equal_belts() {
+fn corexy_needs_three_homed_axes() {
     let refused =
         |text: &str| SimConfig::parse(text, "my.toml").map_or_else(|error| error.to_string(), |_| "accepted".into());
     let corexy = example("A CoreXY printer");
     assert_eq!(refused(&corexy), "accepted");
     for (from, to, part) in [
-        ("steps_per_mm = 80.0", "steps_per_mm = 81.0", "axis `y`, key `steps_per_mm`: both motors move the head"),
         ("name = \"z\"", "name = \"w\"", "key `corexy`: there is no axis `z` with an `endstop_pin`: add it"),
         ("endstop_pin = \"x_endstop\"\n", "", "key `corexy`: there is no axis `x` with an `endstop_pin`: add it"),
     ] {
@@ -205,6 +213,16 @@ fn corexy_needs_three_homed_axes_with_equal_belts() {
     }
     let delta = refused(&format!("corexy = true\n{}", example("A delta printer")));
     assert!(delta.contains("remove `[delta]`"), "{delta}");
+}
+
+#[test]
+fn the_place_of_an_axis_follows_from_the_nozzles() {
+    let config = SimConfig::parse(&example("A delta printer"), "delta").unwrap();
+    let flat_mm = (215.0f64.powi(2) - 105.0f64.powi(2)).sqrt();
+    assert!((config.axis_place("b", [0.0, 0.0, 10.0]).unwrap() - flat_mm - 10.0).abs() < 1e-9);
+    assert_eq!(config.axis_place("b", [500.0, 0.0, 0.0]), None);
+    assert_eq!(config.axis_place("extruder", [0.0; 3]), None);
+    assert_eq!(SimConfig::default_printer().axis_place("y", [1.0, 2.0, 3.0]), Some(2.0));
 }
 
 #[test]

@@ -3,22 +3,24 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
 
 use super::pin::PinName;
 
 /// The end of an axis with its endstop.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum End {
-    /// At 0 mm.
+    /// At the lowest place.
     Min,
-    /// At `travel_mm`.
+    /// At the highest place.
     Max,
 }
 
 /// A stepper motor and its axis.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AxisConfig {
     /// For example `x`.
@@ -37,7 +39,10 @@ pub struct AxisConfig {
     /// Microsteps per full step, for printer.cfg. The motor has 200 full steps per turn.
     #[serde(default = "default_microsteps")]
     pub microsteps: u32,
-    /// The axis moves from 0 to this position. Without this key it has no end.
+    /// The lowest place of the axis.
+    #[serde(default)]
+    pub min_mm: f64,
+    /// The axis moves from `min_mm` to this position. Without this key it has no end.
     pub travel_mm: Option<f64>,
     /// How far beyond either end of its travel the axis moves before it hits something and loses steps.
     #[serde(default = "default_overtravel_mm")]
@@ -50,11 +55,43 @@ pub struct AxisConfig {
     /// The end of the travel with the endstop.
     #[serde(default = "default_end")]
     pub endstop_at: End,
+    /// Where the endstop closes. Without this key it closes at that end.
+    pub endstop_mm: Option<f64>,
     /// Speed of homing, for printer.cfg.
     #[serde(default = "default_homing_mm_per_s")]
     pub homing_mm_per_s: f64,
     /// The place on the bed where a motor of the z axis holds the gantry, or the bed: x and y.
     pub at_mm: Option<[f64; 2]>,
+    /// The carriages that the motor moves together, and which way: `{ x = 1.0, y = -1.0 }`. Without this key the axis has
+    /// a rail of its own.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub carriages: BTreeMap<String, f64>,
+}
+
+/// A rail without a motor of its own. An axis says with `carriages` which of them it moves.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CarriageConfig {
+    /// `x`, `y`, `z`, or another name.
+    pub name: String,
+    /// The lowest place.
+    #[serde(default)]
+    pub min_mm: f64,
+    /// The highest place.
+    pub travel_mm: f64,
+    /// How far beyond either end of its travel it moves before it hits something.
+    #[serde(default = "default_overtravel_mm")]
+    pub overtravel_mm: f64,
+    /// The initial place.
+    #[serde(default)]
+    pub start_mm: f64,
+    /// The endstop's pin. It is high while the carriage is at that end of its travel or beyond.
+    pub endstop_pin: Option<PinName>,
+    /// The end of the travel with the endstop.
+    #[serde(default = "default_end")]
+    pub endstop_at: End,
+    /// Where the endstop closes. Without this key it closes at that end.
+    pub endstop_mm: Option<f64>,
 }
 
 fn default_microsteps() -> u32 {
@@ -75,13 +112,15 @@ fn default_homing_mm_per_s() -> f64 {
 
 /// A delta printer: three towers around the bed. Their carriages hold the nozzle by arms. The carriages are the axes
 /// `a`, `b` and `c`. A carriage is at 0 where the arms would lie flat on the bed.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeltaConfig {
     /// Horizontal length of the arms while the nozzle is in the middle of the bed.
     pub radius_mm: f64,
     /// The length of the arms.
     pub arm_mm: f64,
+    /// The length of each arm, if they differ.
+    pub arms_mm: Option<[f64; 3]>,
     /// From the middle of the bed to its edge.
     pub bed_radius_mm: f64,
     /// The directions of the towers a, b and c, counted from the x axis toward the y axis.
@@ -96,6 +135,11 @@ fn default_angles_degrees() -> [f64; 3] {
 impl DeltaConfig {
     /// The axes of the carriages.
     pub(crate) const TOWERS: [&'static str; 3] = ["a", "b", "c"];
+
+    /// The lengths of the arms.
+    pub(crate) fn arms_mm(&self) -> [f64; 3] {
+        self.arms_mm.unwrap_or([self.arm_mm; 3])
+    }
 
     /// The height of the carriages while the nozzle is on the middle of the bed.
     pub(crate) fn lowest_mm(&self) -> f64 {
@@ -112,7 +156,7 @@ impl DeltaConfig {
 }
 
 /// The limits of the motion in printer.cfg. The simulated axes themselves follow at any speed.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// Highest speed of the head.
@@ -137,7 +181,7 @@ impl Default for Limits {
 }
 
 /// The shape of the bed. Its middle is at 0.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BedConfig {
     /// How much higher the bed is at the end of the x axis than at its start.
@@ -146,4 +190,8 @@ pub struct BedConfig {
     pub y_slope_mm: f64,
     /// How much lower the bed is at the corners than in the middle.
     pub bow_mm: f64,
+    /// The corner of the bed in front, on the left: x and y. Without this key it is where the axes begin.
+    pub min_mm: Option<[f64; 2]>,
+    /// The corner behind, on the right. Without this key it is where the axes end.
+    pub max_mm: Option<[f64; 2]>,
 }

@@ -3,13 +3,13 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::axes::{AxisConfig, BedConfig};
 use super::heater::HeaterConfig;
 
 /// The tables of the default printer that those tests use.
-#[derive(Deserialize)]
+#[derive(Serialize, Deserialize)]
 pub(crate) struct DefaultPrinter {
     #[serde(rename = "axis")]
     pub(crate) axes: Vec<AxisConfig>,

@@ -3,22 +3,23 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-use super::check::{Trouble, fault};
+use super::check::{Bound, Trouble, check, fault};
 use super::pin::PinName;
+use super::sensor::Sensor;
 use super::thermistor::{NoThermistor, Thermistor};
 
 /// A heater, the mass that it heats, and the thermistor in it.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HeaterConfig {
     /// For example `extruder` or `heater_bed`.
     pub name: String,
     /// Power is on while this pin is high. Without this pin it is always on.
     pub pin: Option<PinName>,
-    /// The ADC channel of the thermistor.
-    pub sensor_pin: PinName,
+    /// The ADC channel of the thermistor. Without this pin only a chip reads the temperature.
+    pub sensor_pin: Option<PinName>,
     /// Power while on.
     pub heater_watts: f64,
     /// Heat capacity of the heated mass.
@@ -45,7 +46,12 @@ pub struct HeaterConfig {
     #[serde(default = "default_pullup_ohm")]
     pub pullup_ohm: f64,
     /// The thermistor's resistance at one temperature (with `beta_k`) or at three.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub points_celsius_ohm: Vec<(f64, f64)>,
+    /// In place of a thermistor, the readings of any other sensor: temperatures, each with a fraction of the ADC's
+    /// reference.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub points_celsius_fraction: Vec<(f64, f64)>,
     /// The thermistor's beta.
     pub beta_k: Option<f64>,
 }
@@ -59,7 +65,7 @@ fn default_pullup_ohm() -> f64 {
 }
 
 /// A fan that needs time to spin up and down.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FanConfig {
     /// For example `fan`, which is the part cooling fan.
@@ -97,6 +103,31 @@ impl HeaterConfig {
     /// The initial temperature, in °C.
     pub(crate) fn start_celsius(&self) -> f64 {
         self.start_celsius.unwrap_or(self.ambient_celsius)
+    }
+
+    /// Its sensor at the ADC; `None` if it has none.
+    ///
+    /// # Errors
+    ///
+    /// The key with values that no sensor has, and a remedy.
+    pub(crate) fn sensor(&self) -> Result<Option<Sensor>, Trouble> {
+        const POINTS: &str = "points_celsius_fraction";
+        let whose = &format!("heater `{}`", self.name);
+        if self.sensor_pin.is_none() {
+            return Ok(None);
+        }
+        if self.points_celsius_fraction.is_empty() {
+            return self.thermistor().map(|thermistor| Some(Sensor::Thermistor(thermistor)));
+        }
+        if !self.points_celsius_ohm.is_empty() {
+            return Err(fault(whose, POINTS, "it has points_celsius_ohm, too", "remove one of them"));
+        }
+        for (celsius, fraction) in &self.points_celsius_fraction {
+            check(whose, POINTS, *celsius, Bound::Any)?;
+            check(whose, POINTS, *fraction, Bound::Any)?;
+        }
+        let sensor = Sensor::of_curve(&self.points_celsius_fraction);
+        sensor.map(Some).ok_or_else(|| fault(whose, POINTS, "there is one", "give two or more"))
     }
 
     /// The thermistor that these points and this beta describe.

@@ -4,13 +4,17 @@
 #![forbid(unsafe_code)]
 
 pub(crate) mod axes;
+pub(crate) mod boards;
 pub(crate) mod buses;
 pub(crate) mod check;
 #[cfg(test)]
 pub(crate) mod default;
 pub(crate) mod heater;
+pub(crate) mod kinematics;
 pub(crate) mod outputs;
 pub(crate) mod pin;
 pub(crate) mod printer;
+pub(crate) mod rails;
+pub(crate) mod sensor;
 pub(crate) mod thermistor;
 mod validate;

@@ -3,12 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::pin::PinName;
 
 /// A light of one to four colors.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LedConfig {
     /// For example `light`.
@@ -36,7 +36,7 @@ impl LedConfig {
 }
 
 /// An output for something that needs no simulation.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OutputConfig {
     /// For example `light`.
@@ -46,7 +46,7 @@ pub struct OutputConfig {
 }
 
 /// An input that stays at one level.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InputConfig {
     /// For example `door`.
@@ -55,4 +55,16 @@ pub struct InputConfig {
     pub pin: PinName,
     /// Whether it is on.
     pub level: bool,
+}
+
+/// An analog pin at a fixed level.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AnalogConfig {
+    /// For example `supply`.
+    pub name: String,
+    /// The ADC's channel.
+    pub pin: PinName,
+    /// The voltage as a fraction of the ADC's reference.
+    pub fraction: f64,
 }

@@ -3,11 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use super::axes::{AxisConfig, BedConfig, DeltaConfig, Limits};
+use super::axes::{AxisConfig, BedConfig, CarriageConfig, DeltaConfig, Limits};
 use super::buses::{I2cBusConfig, SpiBusConfig};
 use super::check::{Trouble, there_is};
 use super::heater::{FanConfig, HeaterConfig};
-use super::outputs::{InputConfig, LedConfig, OutputConfig};
+use super::kinematics::{DeltesianConfig, KinematicsConfig, RotaryDeltaConfig, WinchConfig};
+use super::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};
 use super::pin::PinName;
 
 /// A description without its parts: everything that a part may know of its printer.
@@ -16,6 +17,9 @@ pub(crate) struct Printer<'a> {
     pub(crate) seed: u64,
     pub(crate) limits: &'a Limits,
     pub(crate) axes: &'a [AxisConfig],
+    pub(crate) carriages: &'a [CarriageConfig],
+    /// `[kinematics]`. The next two keys are older.
+    pub(crate) chosen: Option<&'a KinematicsConfig>,
     pub(crate) corexy: bool,
     pub(crate) delta: Option<&'a DeltaConfig>,
     pub(crate) heaters: &'a [HeaterConfig],
@@ -23,6 +27,7 @@ pub(crate) struct Printer<'a> {
     pub(crate) leds: &'a [LedConfig],
     pub(crate) outputs: &'a [OutputConfig],
     pub(crate) inputs: &'a [InputConfig],
+    pub(crate) analogs: &'a [AnalogConfig],
     pub(crate) bed: &'a BedConfig,
     pub(crate) spi_buses: &'a [SpiBusConfig],
     pub(crate) i2c_buses: &'a [I2cBusConfig],
@@ -35,23 +40,47 @@ pub(crate) enum Kinematics<'a> {
     Cartesian,
     /// As `Cartesian`, but the motors `x` and `y` drive two belts.
     CoreXy,
+    /// As `Cartesian`, but the motors `x` and `z` drive two belts.
+    CoreXz,
+    /// As `Cartesian`, but the belt of `x` runs along y too.
+    HybridCoreXy,
+    /// As `Cartesian`, but the belt of `x` runs along z too.
+    HybridCoreXz,
+    /// Carriages, and motors that say which of them they move.
+    Generic,
     /// `a`, `b` and `c` together.
     Delta(&'a DeltaConfig),
+    /// `left`, `right` and `y`.
+    Deltesian(&'a DeltesianConfig),
+    /// `bed`, `arm` and `z`.
+    Polar,
+    /// `a`, `b` and `c` turn.
+    RotaryDelta(&'a RotaryDeltaConfig),
+    /// `a`, `b`, `c` and so on are cables.
+    Winch(&'a WinchConfig),
     /// Each axis is only a motor.
     None,
 }
 
 impl Kinematics<'_> {
-    /// Whether the rails are x, y and z.
+    /// Whether x, y and z are independent directions of the head.
     pub(crate) fn has_gantry(&self) -> bool {
-        self.rails().contains(&"z")
+        !self.rails().is_empty() && self.rails() == Kinematics::Cartesian.rails()
     }
 
-    /// The axes of klippy's kinematics. Each may have more than one motor.
+    /// The axes of klippy's kinematics, in its order. Each may have more than one motor.
     pub(crate) fn rails(&self) -> &'static [&'static str] {
         match self {
-            Kinematics::Cartesian | Kinematics::CoreXy => &["x", "y", "z"],
-            Kinematics::Delta(_) => &DeltaConfig::TOWERS,
+            Kinematics::Cartesian
+            | Kinematics::CoreXy
+            | Kinematics::CoreXz
+            | Kinematics::HybridCoreXy
+            | Kinematics::HybridCoreXz
+            | Kinematics::Generic => &["x", "y", "z"],
+            Kinematics::Delta(_) | Kinematics::RotaryDelta(_) => &DeltaConfig::TOWERS,
+            Kinematics::Deltesian(_) => &["left", "right", "y"],
+            Kinematics::Polar => &["bed", "arm", "z"],
+            Kinematics::Winch(winch) => &WinchConfig::CABLES[..winch.anchors_mm.len().min(WinchConfig::CABLES.len())],
             Kinematics::None => &[],
         }
     }
@@ -65,6 +94,22 @@ impl<'a> Printer<'a> {
 
     pub(crate) fn kinematics(&self) -> Kinematics<'a> {
         let can_home = |name| self.axis(name).is_some_and(|axis| axis.endstop_pin.is_some());
+        if let Some(chosen) = self.chosen {
+            return match chosen {
+                KinematicsConfig::None(_) => Kinematics::None,
+                KinematicsConfig::Cartesian(_) => Kinematics::Cartesian,
+                KinematicsConfig::CoreXy(_) => Kinematics::CoreXy,
+                KinematicsConfig::CoreXz(_) => Kinematics::CoreXz,
+                KinematicsConfig::HybridCoreXy(_) => Kinematics::HybridCoreXy,
+                KinematicsConfig::HybridCoreXz(_) => Kinematics::HybridCoreXz,
+                KinematicsConfig::GenericCartesian(_) => Kinematics::Generic,
+                KinematicsConfig::Delta(delta) => Kinematics::Delta(delta),
+                KinematicsConfig::Deltesian(deltesian) => Kinematics::Deltesian(deltesian),
+                KinematicsConfig::Polar(_) => Kinematics::Polar,
+                KinematicsConfig::RotaryDelta(rotary) => Kinematics::RotaryDelta(rotary),
+                KinematicsConfig::Winch(winch) => Kinematics::Winch(winch),
+            };
+        }
         match self.delta {
             Some(delta) => Kinematics::Delta(delta),
             None if self.corexy => Kinematics::CoreXy,
@@ -76,6 +121,15 @@ impl<'a> Printer<'a> {
     /// The motors of a rail, for example `z`, `z1` and `z2`.
     pub(crate) fn motors(&self, rail: &str) -> impl Iterator<Item = &'a AxisConfig> {
         in_a_row(rail, |name| self.axis(name))
+    }
+
+    /// The first motor of the rail that a further motor such as `x1` moves too. The motors of the z axis of a gantry do
+    /// not: each of them holds the gantry, or the bed, at a place of its own.
+    pub(crate) fn first_motor(&self, axis: &str) -> Option<&'a AxisConfig> {
+        let kinematics = self.kinematics();
+        let rails = kinematics.rails().iter().filter(|rail| !kinematics.has_gantry() || **rail != "z");
+        let of_rail = |rail: &&str| self.motors(rail).skip(1).any(|motor| motor.name == axis);
+        rails.into_iter().copied().find(|rail| of_rail(rail)).and_then(|rail| self.axis(rail))
     }
 
     /// The heaters of the hot ends: `extruder`, `extruder1` and so on.
@@ -94,9 +148,25 @@ impl<'a> Printer<'a> {
         self.fans.iter().find(|fan| fan.cools.as_deref() == Some(heater))
     }
 
+    /// Whether the motor of an axis moves several rails, or other motors move its rail.
+    pub(crate) fn shares_belt(&self, axis: &str) -> bool {
+        let kinematics = self.kinematics();
+        let others = self.axes.iter().filter(|other| other.name != axis);
+        let mut belts = others.flat_map(|other| kinematics.belt(&other.name));
+        !kinematics.belt(axis).is_empty()
+            || belts.any(|(rail, _)| *rail == axis)
+            || self.axis(axis).is_some_and(|axis| !axis.carriages.is_empty())
+    }
+
     /// Checks that the axis in a part's key `axis` exists.
     pub(crate) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), Trouble> {
         there_is(whose, "axis", axis, self.axes.iter().map(|axis| &axis.name), "[[axis]]")
+    }
+
+    /// Checks that there is an axis or a carriage of this name.
+    pub(crate) fn check_rail(&self, whose: &str, rail: &str) -> Result<(), Trouble> {
+        let names = self.axes.iter().map(|axis| &axis.name).chain(self.carriages.iter().map(|rail| &rail.name));
+        there_is(whose, "axis", rail, names, "[[axis]]")
     }
 
     /// Checks that the heater in a part's key `heater` exists.

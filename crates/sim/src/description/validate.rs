@@ -3,12 +3,17 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashSet;
+
 use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
 use super::buses::{I2cBusConfig, SpiBusConfig};
-use super::check::{Bound, Trouble, UsedPins, check, there_is, unique, wrong};
+use super::check::{Bound, Trouble, UsedPins, check, no_name, there_is, unique, wrong};
 use super::heater::{FanConfig, HeaterConfig};
+use super::kinematics::WinchConfig;
 use super::outputs::LedConfig;
+use super::pin::is_local;
 use super::printer::{Kinematics, Printer};
+use super::rails::Gears;
 use super::thermistor::KELVIN;
 
 impl Printer<'_> {
@@ -17,7 +22,7 @@ impl Printer<'_> {
     /// # Errors
     ///
     /// The first wrong value, with its key and a remedy.
-    pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
+    pub(crate) fn validate(&self, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
         self.limits.validate()?;
         unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
         unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name))?;
@@ -25,15 +30,25 @@ impl Printer<'_> {
         unique("[[led]]", self.leds.iter().map(|led| &led.name))?;
         unique("[[output]]", self.outputs.iter().map(|output| &output.name))?;
         unique("[[input]]", self.inputs.iter().map(|input| &input.name))?;
-        unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
+        unique("[[analog]]", self.analogs.iter().map(|analog| &analog.name))?;
+        unique("[[carriage]]", self.carriages.iter().map(|carriage| &carriage.name))?;
+        unique_on_boards("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
         self.axes.iter().try_for_each(|axis| axis.validate(pins))?;
         self.validate_places()?;
-        if let Some(delta) = self.delta {
-            delta.validate(self)?;
-        }
+        self.validate_carriages(pins)?;
         if self.corexy {
             self.validate_corexy()?;
         }
+        match (self.chosen, self.kinematics()) {
+            (Some(_), _) if self.delta.is_some() || self.corexy => {
+                let trouble = Trouble::new("there is another kinematics").remedy("remove `corexy` and `[delta]`");
+                return Err(trouble.of("[kinematics]"));
+            }
+            (_, Kinematics::Delta(delta)) => delta.validate(self)?,
+            (Some(_), kinematics) => self.validate_rails(kinematics)?,
+            (None, _) => {}
+        }
+        Gears::of(self)?;
         self.heaters.iter().try_for_each(|heater| heater.validate(self, pins))?;
         self.fans.iter().try_for_each(|fan| fan.validate(self, pins))?;
         self.leds.iter().try_for_each(|led| led.validate(pins))?;
@@ -43,13 +58,90 @@ impl Printer<'_> {
         for input in self.inputs {
             pins.claim(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
         }
-        unique("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
+        unique_on_boards("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
         self.bed.validate()?;
         for bus in self.spi_buses {
             bus.validate(self)?;
-            pins.claim(&format!("spi_bus `{}`", bus.name), "name", Some(&bus.mosi_pin()))?;
+            let whose = &format!("spi_bus `{}`", bus.name);
+            match bus.lines() {
+                None => pins.claim(whose, "name", Some(&bus.output_pin()))?,
+                Some([miso, mosi, sclk]) => {
+                    pins.claim(whose, "miso_pin", Some(miso))?;
+                    // A chip without a data input has no line for it.
+                    pins.claim(whose, "mosi_pin", Some(mosi).filter(|mosi| mosi.name != miso.name))?;
+                    pins.claim(whose, "sclk_pin", Some(sclk))?;
+                }
+            }
         }
-        self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)
+        for analog in self.analogs {
+            let whose = &format!("analog `{}`", analog.name);
+            pins.claim(whose, "pin", Some(&analog.pin))?;
+            check(whose, "fraction", analog.fraction, Bound::NotNegative)?;
+        }
+        for bus in self.i2c_buses {
+            bus.validate()?;
+            for (key, pin) in ["scl_pin", "sda_pin"].into_iter().zip(bus.lines().into_iter().flatten()) {
+                pins.claim(&format!("i2c_bus `{}`", bus.name), key, Some(pin))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn validate_carriages(&self, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
+        self.carriages.iter().try_for_each(|carriage| {
+            let whose = &format!("carriage `{}`", carriage.name);
+            if self.axes.iter().any(|axis| axis.name == carriage.name && axis.carriages.is_empty()) {
+                return wrong(whose, "name", "an axis with a rail of its own has this name", "rename one");
+            }
+            pins.claim(whose, "endstop_pin", carriage.endstop_pin.as_ref())?;
+            let travel_mm = (carriage.min_mm, carriage.travel_mm);
+            check_travel(whose, travel_mm, carriage.overtravel_mm, carriage.start_mm)?;
+            check(whose, "endstop_mm", carriage.endstop_mm.unwrap_or(0.0), Bound::Any)
+        })
+    }
+
+    /// Checks that the rails of a kinematics are there, and its lengths.
+    fn validate_rails(&self, kinematics: Kinematics<'_>) -> Result<(), Trouble> {
+        const WHOSE: &str = "[kinematics]";
+        let is_there =
+            |rail: &&&str| self.axis(rail).is_some() || self.carriages.iter().any(|carriage| carriage.name == **rail);
+        if let Some(missing) = kinematics.rails().iter().find(|rail| !is_there(rail)) {
+            let trouble = Trouble::new(format!("there is no axis `{missing}`"));
+            return Err(trouble.remedy("add an [[axis]] for each rail").of(WHOSE));
+        }
+        let above_zero =
+            |key, lengths: &[f64]| lengths.iter().try_for_each(|mm| check(WHOSE, key, *mm, Bound::AboveZero));
+        match kinematics {
+            Kinematics::Deltesian(deltesian) => {
+                above_zero("arms_mm", &deltesian.arms_mm)?;
+                above_zero("arm_x_mm", &deltesian.arm_x_mm)?;
+                if deltesian.arms_mm.iter().zip(deltesian.arm_x_mm).any(|(arm, x)| *arm <= x) {
+                    return wrong(WHOSE, "arms_mm", "an arm does not reach over its arm_x_mm", "give longer arms");
+                }
+                Ok(())
+            }
+            Kinematics::RotaryDelta(rotary) => {
+                above_zero("upper_arms_mm", &rotary.upper_arms_mm)?;
+                above_zero("lower_arms_mm", &rotary.lower_arms_mm)?;
+                above_zero("bed_radius_mm", &[rotary.bed_radius_mm])?;
+                let places = [rotary.shoulder_radius_mm, rotary.shoulder_height_mm];
+                places.iter().try_for_each(|mm| check(WHOSE, "shoulder_radius_mm", *mm, Bound::Any))?;
+                rotary
+                    .angles_degrees
+                    .iter()
+                    .try_for_each(|degrees| check(WHOSE, "angles_degrees", *degrees, Bound::Any))
+            }
+            Kinematics::Winch(winch) => {
+                let count = winch.anchors_mm.len();
+                if !(3..=WinchConfig::CABLES.len()).contains(&count) {
+                    let cause = format!("there are {count}");
+                    return wrong(WHOSE, "anchors_mm", &cause, "give three to eight");
+                }
+                above_zero("bed_radius_mm", &[winch.bed_radius_mm])?;
+                winch.anchors_mm.iter().flatten().try_for_each(|mm| check(WHOSE, "anchors_mm", *mm, Bound::Any))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Checks the axes of a CoreXY printer.
@@ -64,11 +156,6 @@ impl Printer<'_> {
         if let Some(missing) = Kinematics::CoreXy.rails().iter().find(|name| !homed(name)) {
             let trouble = Trouble::new(format!("there is no axis `{missing}` with an `endstop_pin`"));
             return Err(trouble.remedy("add it").of(WHOSE));
-        }
-        let steps_per_mm = |name| self.axis(name).map(|axis| axis.steps_per_mm);
-        if steps_per_mm("x") != steps_per_mm("y") {
-            let cause = "both motors move the head along x";
-            return wrong("axis `y`", "steps_per_mm", cause, "give the axes x and y the same");
         }
         Ok(())
     }
@@ -146,9 +233,40 @@ impl DeltaConfig {
     }
 }
 
+/// Checks the ends of a rail, and that it starts between them.
+fn check_travel(whose: &str, (min_mm, max_mm): (f64, f64), overtravel_mm: f64, start_mm: f64) -> Result<(), Trouble> {
+    check(whose, "min_mm", min_mm, Bound::Any)?;
+    check(whose, "overtravel_mm", overtravel_mm, Bound::NotNegative)?;
+    // Most axes begin at 0.
+    check(whose, "travel_mm", max_mm, if min_mm == 0.0 { Bound::AboveZero } else { Bound::Any })?;
+    check(whose, "start_mm", start_mm, Bound::Any)?;
+    if max_mm <= min_mm {
+        return wrong(whose, "travel_mm", &format!("{max_mm} is not above min_mm"), "raise it");
+    }
+    if !(min_mm - overtravel_mm..=max_mm + overtravel_mm).contains(&start_mm) {
+        let cause = format!("{start_mm} is out of its reach");
+        return wrong(whose, "start_mm", &cause, &format!("start between {min_mm} and {max_mm}"));
+    }
+    Ok(())
+}
+
+/// Checks the names of buses, which may be on several boards.
+fn unique_on_boards<'a>(kind: &str, names: impl Iterator<Item = &'a String>) -> Result<(), Trouble> {
+    let mut seen = HashSet::new();
+    for name in names {
+        if !is_local(name) {
+            return no_name(kind, name);
+        }
+        if !seen.insert(name) {
+            return wrong(kind, "name", &format!("two are called `{name}`"), "rename one");
+        }
+    }
+    Ok(())
+}
+
 impl LedConfig {
     /// Checks that it has a pin, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
+    fn validate(&self, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
         let whose = &format!("led `{}`", self.name);
         if self.pins().into_iter().all(|(_, pin)| pin.is_none()) {
             return wrong(whose, "pin", "it has none", "add it, or `red_pin`, `green_pin` and `blue_pin`");
@@ -159,31 +277,24 @@ impl LedConfig {
 
 impl AxisConfig {
     /// Checks the axis alone, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
+    fn validate(&self, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
         use Bound::{AboveZero, Any, NotNegative};
         let whose = &format!("axis `{}`", self.name);
         pins.claim(whose, "step_pin", Some(&self.step_pin))?;
         pins.claim(whose, "dir_pin", Some(&self.dir_pin))?;
-        pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
+        // One line may enable several motors.
+        pins.claim_for(Some("enable"), whose, "enable_pin", self.enable_pin.as_ref())?;
         pins.claim(whose, "endstop_pin", self.endstop_pin.as_ref())?;
         check(whose, "steps_per_mm", self.steps_per_mm, AboveZero)?;
         check(whose, "microsteps", self.microsteps.into(), AboveZero)?;
         check(whose, "overtravel_mm", self.overtravel_mm, NotNegative)?;
         check(whose, "start_mm", self.start_mm, Any)?;
         check(whose, "homing_mm_per_s", self.homing_mm_per_s, AboveZero)?;
+        check(whose, "min_mm", self.min_mm, Any)?;
+        check(whose, "endstop_mm", self.endstop_mm.unwrap_or(0.0), Any)?;
+        self.carriages.values().try_for_each(|way| check(whose, "carriages", *way, Any))?;
         match self.travel_mm {
-            Some(travel_mm) => {
-                check(whose, "travel_mm", travel_mm, AboveZero)?;
-                let free = -self.overtravel_mm..=travel_mm + self.overtravel_mm;
-                if !free.contains(&self.start_mm) {
-                    return wrong(
-                        whose,
-                        "start_mm",
-                        &format!("{} is out of its reach", self.start_mm),
-                        &format!("start between 0 and {travel_mm}"),
-                    );
-                }
-            }
+            Some(travel_mm) => check_travel(whose, (self.min_mm, travel_mm), self.overtravel_mm, self.start_mm)?,
             None if self.endstop_pin.is_some() => {
                 return wrong(
                     whose,
@@ -200,7 +311,7 @@ impl AxisConfig {
 
 impl FanConfig {
     /// Checks the fan, and that its pins are free.
-    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("fan `{}`", self.name);
         pins.claim(whose, "pin", Some(&self.pin))?;
@@ -255,7 +366,7 @@ impl BedConfig {
 
 impl HeaterConfig {
     /// Checks the heater with its fan, and that its pins are free.
-    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins<'_>) -> Result<(), Trouble> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("heater `{}`", self.name);
         pins.claim(whose, "pin", self.pin.as_ref())?;
@@ -264,11 +375,12 @@ impl HeaterConfig {
         {
             return wrong(whose, "pin", "klippy's heater of this name has one", "add it, or rename the heater");
         }
-        pins.claim(whose, "sensor_pin", Some(&self.sensor_pin))?;
-        if self.sensor_pin.inverted {
+        pins.claim(whose, "sensor_pin", self.sensor_pin.as_ref())?;
+        if self.sensor_pin.as_ref().is_some_and(|pin| pin.inverted) {
             return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
         }
-        check(whose, "heater_watts", self.heater_watts, AboveZero)?;
+        // Without a heater there is only a sensor.
+        check(whose, "heater_watts", self.heater_watts, if self.pin.is_some() { AboveZero } else { NotNegative })?;
         check(whose, "heat_capacity_j_per_k", self.heat_capacity_j_per_k, AboveZero)?;
         check(whose, "loss_w_per_k", self.loss_w_per_k, AboveZero)?;
         check(whose, "sensor_lag_s", self.sensor_lag_s, NotNegative)?;
@@ -285,7 +397,7 @@ impl HeaterConfig {
         self.validate_temperatures(whose)?;
         check(whose, "noise_counts", self.noise_counts, NotNegative)?;
         check(whose, "pullup_ohm", self.pullup_ohm, AboveZero)?;
-        self.thermistor()?;
+        self.sensor()?;
         Ok(())
     }
 

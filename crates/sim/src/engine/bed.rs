@@ -8,8 +8,9 @@
 
 use std::sync::Arc;
 
-use super::physics::Axis;
-use crate::description::axes::{BedConfig, DeltaConfig};
+use super::linkage::{Linkage, RAILS_MAX};
+use super::motion::Rail;
+use crate::description::axes::BedConfig;
 
 /// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.
 ///
@@ -19,12 +20,12 @@ pub struct Plane {
     /// The middle of the motors.
     middle: [f64; 2],
     /// The motors, and how much each one tilts the plane along x and y: per millimeter of the motor's position.
-    motors: Vec<(Arc<Axis>, [f64; 2])>,
+    motors: Vec<(Arc<Rail>, [f64; 2])>,
 }
 
 impl Plane {
     /// The plane that these motors hold at these places.
-    pub fn new(motors: Vec<(Arc<Axis>, [f64; 2])>) -> Plane {
+    pub fn new(motors: Vec<(Arc<Rail>, [f64; 2])>) -> Plane {
         let count = motors.len().max(1) as f64;
         let sum = |term: &dyn Fn(&[f64; 2]) -> f64| motors.iter().map(|(_, at)| term(at)).sum::<f64>();
         let middle = [sum(&|at| at[0]) / count, sum(&|at| at[1]) / count];
@@ -49,120 +50,118 @@ impl Plane {
     }
 
     /// The height of the plane at a place, while the motors are at these positions.
-    fn height_mm(&self, [x_mm, y_mm]: [f64; 2], position_mm: impl Fn(&Axis) -> f64) -> f64 {
+    fn height_mm(&self, [x_mm, y_mm]: [f64; 2], position_mm: impl Fn(&Rail) -> f64) -> f64 {
         let mean = 1.0 / self.motors.len().max(1) as f64;
         let (x_mm, y_mm) = (x_mm - self.middle[0], y_mm - self.middle[1]);
         self.motors.iter().map(|(axis, [x, y])| position_mm(axis) * (mean + x * x_mm + y * y_mm)).sum()
     }
 }
 
-/// A delta printer's head. It stays upright.
-pub struct Delta {
-    carriages: [Arc<Axis>; 3],
-    towers_mm: [[f64; 2]; 3],
-    arm_mm: f64,
-    bed_radius_mm: f64,
+/// A head that hangs on a linkage. It stays upright.
+pub struct Hanging {
+    linkage: Linkage,
+    /// In the linkage's order.
+    rails: Vec<Arc<Rail>>,
+    bed: BedShape,
 }
 
-impl Delta {
-    pub fn new(config: &DeltaConfig, carriages: [Arc<Axis>; 3]) -> Delta {
-        Delta { carriages, towers_mm: config.towers_mm(), arm_mm: config.arm_mm, bed_radius_mm: config.bed_radius_mm }
+impl Hanging {
+    pub fn new(linkage: Linkage, rails: Vec<Arc<Rail>>, bed: BedShape) -> Hanging {
+        Hanging { linkage, rails, bed }
     }
 
-    /// The nozzle's position: one arm's length from each carriage, and below them.
-    fn nozzle_mm(&self, position_mm: impl Fn(&Axis) -> f64) -> [f64; 3] {
-        let [a, b, c] = [0, 1, 2].map(|tower| {
-            let [x, y] = self.towers_mm[tower];
-            let z = position_mm(&self.carriages[tower]);
-            ([x, y, z], x * x + y * y + z * z)
-        });
-        // The difference of two spheres is a plane: [x, y, z] · plane = level. Two planes leave x and y as lines of z:
-        // x = x0 + x1 z, y = y0 + y1 z.
-        let plane = |other: ([f64; 3], f64)| {
-            let normal = [0, 1, 2].map(|axis| other.0[axis] - a.0[axis]);
-            (normal, (other.1 - a.1) / 2.0)
-        };
-        let ((n, nd), (m, md)) = (plane(b), plane(c));
-        let determinant = n[0] * m[1] - n[1] * m[0];
-        let solve = |p: f64, q: f64| [(p * m[1] - q * n[1]) / determinant, (q * n[0] - p * m[0]) / determinant];
-        let ([x0, y0], [x1, y1]) = (solve(nd, md), solve(-n[2], -m[2]));
-        let (dx, dy, az) = (x0 - a.0[0], y0 - a.0[1], a.0[2]);
-        let square = x1 * x1 + y1 * y1 + 1.0;
-        let half = x1 * dx + y1 * dy - az;
-        let rest = dx * dx + dy * dy + az * az - self.arm_mm * self.arm_mm;
-        // If the arms cannot join the carriages, they count as stretched.
-        let z = (-half - (half * half - square * rest).max(0.0).sqrt()) / square;
-        [x0 + x1 * z, y0 + y1 * z, z]
+    fn nozzle_mm(&self, position_mm: impl Fn(&Rail) -> f64) -> [f64; 3] {
+        let mut places = [0.0; RAILS_MAX];
+        places.iter_mut().zip(&self.rails).for_each(|(place, rail)| *place = position_mm(rail));
+        self.linkage.nozzle_mm(&places)
     }
 }
 
 /// The kinematics that hold the nozzle over the bed.
 pub enum Head {
-    /// Axes along x and y, and the motors of the z axis.
-    Cartesian { x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Plane },
-    /// Three arms.
-    Delta(Delta),
+    /// Rails along x and y, and those of the z axis.
+    Cartesian { x: Option<Arc<Rail>>, y: Option<Arc<Rail>>, z: Plane },
+    /// Arms, cables, or a bed that turns.
+    Hanging(Hanging),
 }
 
 impl Head {
-    /// The position of a point at this offset from the nozzle, while the axes are at these positions.
+    /// The position of a point at this offset from the nozzle, while the rails are at these positions.
     fn point_mm(
         &self,
         [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3],
-        position_mm: impl Fn(&Axis) -> f64,
+        position_mm: impl Fn(&Rail) -> f64,
     ) -> [f64; 3] {
         match self {
             Head::Cartesian { x, y, z } => {
-                let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| position_mm(axis));
+                let position = |rail: &Option<Arc<Rail>>| rail.as_ref().map_or(0.0, |rail| position_mm(rail));
                 let (x_mm, y_mm) = (position(x) + x_offset_mm, position(y) + y_offset_mm);
                 // The head is tilted like the gantry. If the motors hold the bed, the bed is tilted instead.
                 [x_mm, y_mm, z.height_mm([x_mm, y_mm], &position_mm) + z_offset_mm]
             }
-            Head::Delta(delta) => {
-                let [x_mm, y_mm, z_mm] = delta.nozzle_mm(position_mm);
+            Head::Hanging(hanging) => {
+                let [x_mm, y_mm, z_mm] = hanging.nozzle_mm(position_mm);
                 [x_mm + x_offset_mm, y_mm + y_offset_mm, z_mm + z_offset_mm]
             }
         }
     }
 
-    /// The nozzle's place, while the axes are at these positions.
-    pub(crate) fn nozzle_mm(&self, position_mm: impl Fn(&Axis) -> f64) -> [f64; 3] {
+    /// The nozzle's place, while the rails are at these positions.
+    pub(crate) fn nozzle_mm(&self, position_mm: impl Fn(&Rail) -> f64) -> [f64; 3] {
         self.point_mm([0.0; 3], position_mm)
     }
 
-    /// The axes that move the nozzle.
-    pub(crate) fn axes(&self) -> Vec<&Arc<Axis>> {
+    /// The rails that move the nozzle.
+    pub(crate) fn rails(&self) -> Vec<&Arc<Rail>> {
         match self {
-            Head::Cartesian { x, y, z } => x.iter().chain(y).chain(z.motors.iter().map(|(motor, _)| motor)).collect(),
-            Head::Delta(delta) => delta.carriages.iter().collect(),
+            Head::Cartesian { x, y, z } => x.iter().chain(y).chain(z.motors.iter().map(|(rail, _)| rail)).collect(),
+            Head::Hanging(hanging) => hanging.rails.iter().collect(),
+        }
+    }
+
+    /// The greatest way of the nozzle in a step.
+    pub(crate) fn step_mm(&self) -> f64 {
+        let steps_mm = |leverage_mm: &dyn Fn(usize) -> f64| {
+            let rails = self.rails().into_iter().enumerate();
+            rails.map(|(n, rail)| rail.step_mm() * leverage_mm(n)).fold(0.0, f64::max)
+        };
+        match self {
+            Head::Cartesian { .. } => steps_mm(&|_| 1.0),
+            Head::Hanging(hanging) => steps_mm(&|rail| hanging.linkage.leverage_mm(rail, hanging.bed.reach_mm())),
         }
     }
 
     /// The space that the nozzle can reach; `None` if it has no end.
     pub(crate) fn space(&self) -> Option<Space> {
-        let travel = |axis: &Arc<Axis>| axis.travel_mm;
+        let travel = |rail: &Arc<Rail>| rail.travel_mm;
         match self {
-            Head::Cartesian { x, y, z } => Some(Space {
-                bed: BedShape::Rectangle {
-                    min_mm: [0.0; 2],
-                    max_mm: [x.as_ref().and_then(travel)?, y.as_ref().and_then(travel)?],
-                },
-                height_mm: z.motors.iter().filter_map(|(motor, _)| motor.travel_mm).reduce(f64::min)?,
-            }),
-            Head::Delta(delta) => Some(Space {
-                bed: BedShape::Disc { radius_mm: delta.bed_radius_mm },
-                height_mm: delta.nozzle_mm(|axis| axis.travel_mm.unwrap_or(0.0))[2],
-            }),
+            Head::Cartesian { x, y, z } => {
+                let (x, y) = (x.as_ref().and_then(travel)?, y.as_ref().and_then(travel)?);
+                let heights = z.motors.iter().filter_map(|(rail, _)| travel(rail).map(|(_, max_mm)| max_mm));
+                Some(Space {
+                    bed: BedShape::Rectangle { min_mm: [x.0, y.0], max_mm: [x.1, y.1] },
+                    height_mm: heights.reduce(f64::min)?,
+                })
+            }
+            Head::Hanging(Hanging { linkage: Linkage::Winch { anchors_mm }, bed, .. }) => {
+                let height_mm = anchors_mm.iter().map(|anchor| anchor[2]).fold(0.0, f64::max);
+                Some(Space { bed: *bed, height_mm })
+            }
+            Head::Hanging(hanging) => {
+                let highest = |rail: &Rail| rail.travel_mm.map_or(0.0, |(_, max_mm)| max_mm);
+                Some(Space { bed: hanging.bed, height_mm: hanging.nozzle_mm(highest)[2] })
+            }
         }
     }
 
     /// The ends of the bed along x and y; `None` if nothing moves along that direction.
     fn ends_mm(&self) -> [Option<(f64, f64)>; 2] {
         match self {
-            Head::Cartesian { x, y, .. } => {
-                [x, y].map(|axis| axis.as_ref().and_then(|axis| Some((0.0, axis.travel_mm?))))
-            }
-            Head::Delta(delta) => [Some((-delta.bed_radius_mm, delta.bed_radius_mm)); 2],
+            Head::Cartesian { x, y, .. } => [x, y].map(|rail| rail.as_ref().and_then(|rail| rail.travel_mm)),
+            Head::Hanging(hanging) => match hanging.bed {
+                BedShape::Rectangle { min_mm, max_mm } => [0, 1].map(|n| Some((min_mm[n], max_mm[n]))),
+                BedShape::Disc { radius_mm } => [Some((-radius_mm, radius_mm)); 2],
+            },
         }
     }
 }
@@ -184,6 +183,18 @@ pub enum BedShape {
     },
 }
 
+impl BedShape {
+    /// The farthest place from the middle of the coordinates.
+    fn reach_mm(&self) -> f64 {
+        match self {
+            BedShape::Rectangle { min_mm, max_mm } => {
+                [0, 1].map(|n| min_mm[n].abs().max(max_mm[n].abs())).into_iter().fold(0.0, f64::hypot)
+            }
+            BedShape::Disc { radius_mm } => *radius_mm,
+        }
+    }
+}
+
 /// The space that the nozzle can reach.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Space {
@@ -202,12 +213,22 @@ pub struct Bed {
 
 impl Bed {
     pub fn new(shape: BedConfig, head: Head) -> Bed {
-        Bed { shape, ends_mm: head.ends_mm(), head }
+        let ends_mm = match (shape.min_mm, shape.max_mm) {
+            (Some(min_mm), Some(max_mm)) => [0, 1].map(|n| Some((min_mm[n], max_mm[n]))),
+            _ => head.ends_mm(),
+        };
+        Bed { shape, ends_mm, head }
     }
 
     /// The bed under a cartesian printer with one motor for each axis.
     #[cfg(test)]
-    pub fn under(shape: BedConfig, x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Option<Arc<Axis>>) -> Bed {
+    pub fn under(
+        shape: BedConfig,
+        x: Option<Arc<super::motion::Axis>>,
+        y: Option<Arc<super::motion::Axis>>,
+        z: Option<Arc<super::motion::Axis>>,
+    ) -> Bed {
+        let [x, y, z] = [x, y, z].map(|axis| axis.map(|axis| axis.rail().clone()));
         let z = Plane::new(z.into_iter().map(|z| (z, [0.0; 2])).collect());
         Bed::new(shape, Head::Cartesian { x, y, z })
     }
@@ -226,8 +247,18 @@ impl Bed {
 
     /// How far the point at this offset from the nozzle is above the bed; negative if it presses into the bed.
     pub fn clearance_mm(&self, offset_mm: [f64; 3]) -> f64 {
-        let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm, Axis::position_mm);
+        let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm, Rail::position_mm);
         z_mm - self.height_mm(x_mm, y_mm)
+    }
+
+    /// The space over it that the nozzle can reach; `None` if it has no end.
+    pub(crate) fn space(&self) -> Option<Space> {
+        let space = self.head.space()?;
+        let bed = match (self.shape.min_mm, self.shape.max_mm) {
+            (Some(min_mm), Some(max_mm)) => BedShape::Rectangle { min_mm, max_mm },
+            _ => space.bed,
+        };
+        Some(Space { bed, ..space })
     }
 
     /// The kinematics over it.
@@ -239,16 +270,22 @@ impl Bed {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::description::axes::AxisConfig;
+    use crate::description::axes::{AxisConfig, DeltaConfig};
+    use crate::engine::motion::Axis;
     use proptest::prelude::*;
     use std::f64::consts::TAU;
 
     /// An axis that stands at a place.
-    fn axis_at(start_mm: f64) -> Arc<Axis> {
+    fn axis_at(start_mm: f64) -> Arc<Rail> {
         let text = "name = \"z\"\nstep_pin = \"s\"\ndir_pin = \"d\"\nsteps_per_mm = 1000000.0\n";
         let mut config: AxisConfig = toml::from_str(text).unwrap();
         config.start_mm = start_mm;
-        Arc::new(Axis::new(&config))
+        Axis::new(&config).rail().clone()
+    }
+
+    fn hanging(config: &DeltaConfig, carriages: [Arc<Rail>; 3]) -> Head {
+        let bed = BedShape::Disc { radius_mm: config.bed_radius_mm };
+        Head::Hanging(Hanging::new(config.into(), carriages.into(), bed))
     }
 
     fn plane(motors: &[([f64; 2], f64)]) -> Plane {
@@ -262,17 +299,17 @@ mod tests {
     #[test]
     fn one_motor_lifts_all_of_it_and_two_tilt_it_along_their_line() {
         let one = plane(&[([30.0, 40.0], 2.5)]);
-        assert_near(one.height_mm([-500.0, 900.0], Axis::position_mm), 2.5);
+        assert_near(one.height_mm([-500.0, 900.0], Rail::position_mm), 2.5);
         let two = plane(&[([0.0, 100.0], 1.0), ([200.0, 100.0], 3.0)]);
         for y_mm in [-50.0, 100.0, 220.0] {
-            assert_near(two.height_mm([0.0, y_mm], Axis::position_mm), 1.0);
-            assert_near(two.height_mm([50.0, y_mm], Axis::position_mm), 1.5);
-            assert_near(two.height_mm([300.0, y_mm], Axis::position_mm), 4.0);
+            assert_near(two.height_mm([0.0, y_mm], Rail::position_mm), 1.0);
+            assert_near(two.height_mm([50.0, y_mm], Rail::position_mm), 1.5);
+            assert_near(two.height_mm([300.0, y_mm], Rail::position_mm), 4.0);
         }
         // Without places all motors stand at one place.
         let nowhere = plane(&[([0.0, 0.0], 1.0), ([0.0, 0.0], 3.0)]);
-        assert_near(nowhere.height_mm([170.0, 20.0], Axis::position_mm), 2.0);
-        assert_near(plane(&[]).height_mm([1.0, 1.0], Axis::position_mm), 0.0);
+        assert_near(nowhere.height_mm([170.0, 20.0], Rail::position_mm), 2.0);
+        assert_near(plane(&[]).height_mm([1.0, 1.0], Rail::position_mm), 0.0);
     }
 
     #[test]
@@ -280,7 +317,7 @@ mod tests {
         let at = [[0.0, 0.0], [0.0, 200.0], [200.0, 200.0], [200.0, 0.0]];
         let twisted = plane(&[(at[0], 1.0), (at[1], 0.0), (at[2], 1.0), (at[3], 0.0)]);
         for [x_mm, y_mm] in at {
-            assert_near(twisted.height_mm([x_mm, y_mm], Axis::position_mm), 0.5);
+            assert_near(twisted.height_mm([x_mm, y_mm], Rail::position_mm), 0.5);
         }
     }
 
@@ -294,7 +331,7 @@ mod tests {
             let height = |[x, y]: [f64; 2]| level + slopes[0] * x + slopes[1] * y;
             let at = [[-20.0, 10.0], [110.0, 260.0], [240.0, 15.0], [250.0, 280.0]];
             let motors: Vec<_> = at.iter().take(if four { 4 } else { 3 }).map(|at| (*at, height(*at))).collect();
-            assert_near(plane(&motors).height_mm(place, Axis::position_mm), height(place));
+            assert_near(plane(&motors).height_mm(place, Rail::position_mm), height(place));
         }
 
         /// The nozzle of a delta is where klippy's formula for its towers puts the carriages. Only places on the bed
@@ -308,6 +345,7 @@ mod tests {
             let config = DeltaConfig {
                 radius_mm: 105.0,
                 arm_mm: 215.0,
+                arms_mm: None,
                 bed_radius_mm: 90.0,
                 angles_degrees: [210.0 + turn, 330.0, 90.0],
             };
@@ -316,8 +354,8 @@ mod tests {
                 z + (215.0f64.powi(2) - (x - tower_x).powi(2) - (y - tower_y).powi(2)).sqrt()
             };
             let carriages = [0, 1, 2].map(|tower| axis_at(carriage(tower)));
-            let head = Head::Delta(Delta::new(&config, carriages));
-            let point = head.point_mm([1.0, -2.0, -3.0], Axis::position_mm);
+            let head = hanging(&config, carriages);
+            let point = head.point_mm([1.0, -2.0, -3.0], Rail::position_mm);
             for (value, expected) in point.into_iter().zip([x + 1.0, y - 2.0, z - 3.0]) {
                 assert_near(value, expected);
             }
@@ -326,11 +364,16 @@ mod tests {
 
     #[test]
     fn the_bed_of_a_delta_has_its_middle_at_zero() {
-        let config =
-            DeltaConfig { radius_mm: 105.0, arm_mm: 215.0, bed_radius_mm: 90.0, angles_degrees: [210.0, 330.0, 90.0] };
+        let config = DeltaConfig {
+            radius_mm: 105.0,
+            arm_mm: 215.0,
+            arms_mm: None,
+            bed_radius_mm: 90.0,
+            angles_degrees: [210.0, 330.0, 90.0],
+        };
         let carriages = [0, 1, 2].map(|_| axis_at(config.lowest_mm() + 7.0));
-        let shape = BedConfig { x_slope_mm: 0.2, y_slope_mm: 0.0, bow_mm: 0.1 };
-        let bed = Bed::new(shape, Head::Delta(Delta::new(&config, carriages)));
+        let shape = BedConfig { x_slope_mm: 0.2, bow_mm: 0.1, ..BedConfig::default() };
+        let bed = Bed::new(shape, hanging(&config, carriages));
         assert_near(bed.clearance_mm([0.0, 0.0, -2.0]), 5.0);
         assert_near(bed.height_mm(90.0, 0.0), 0.1 - 0.05);
         assert_near(bed.height_mm(-90.0, 0.0), -0.1 - 0.05);

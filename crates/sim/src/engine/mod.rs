@@ -3,11 +3,14 @@
 
 #![forbid(unsafe_code)]
 
+pub(crate) mod assemble;
 pub(crate) mod bed;
 pub(crate) mod follower;
 pub(crate) mod i2c;
 pub(crate) mod led;
+pub(crate) mod linkage;
 pub(crate) mod look;
+pub(crate) mod motion;
 pub(crate) mod noise;
 pub(crate) mod physics;
 pub(crate) mod recorder;

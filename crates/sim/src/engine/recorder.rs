@@ -9,8 +9,8 @@
 use std::sync::Arc;
 
 use super::bed::Bed;
-use super::follower::{Follower, Motion};
-use super::physics::Axis;
+use super::follower::Followers;
+use super::motion::{Axis, Rail};
 use pinion_firmware::time::{Clock, Ticks};
 
 /// Highest number of points that a recorder keeps: 235 MB. A print of ten hours has about half of them.
@@ -64,20 +64,12 @@ impl Sample {
     }
 }
 
-/// An axis, and its next motion.
-struct Source {
-    axis: Arc<Axis>,
-    follower: Follower,
-    next: Option<Motion>,
-    mm: f64,
-}
-
-/// Reads the steps of all axes in the order of their instants.
+/// Reads the steps of all motors in the order of their instants.
 struct Merger {
     bed: Arc<Bed>,
-    sources: Vec<Source>,
-    /// How many of the sources feed filament. They come last.
-    extruders: usize,
+    followers: Followers,
+    /// They feed filament.
+    extruders: Vec<Arc<Rail>>,
     last: Sample,
     /// The farthest position of the filament.
     pushed_mm: f64,
@@ -85,56 +77,29 @@ struct Merger {
 
 impl Merger {
     fn new(bed: Arc<Bed>, extruders: &[Arc<Axis>], now: Clock) -> Merger {
-        let axes = bed.head().axes();
-        let source = |axis: &Arc<Axis>| {
-            let follower = Follower::from_here(axis.clone());
-            Source { mm: axis.position_mm(), follower, next: None, axis: axis.clone() }
-        };
-        let sources: Vec<Source> = axes.into_iter().chain(extruders).map(source).collect();
+        let extruders: Vec<Arc<Rail>> = extruders.iter().map(|axis| axis.rail().clone()).collect();
+        let followers = Followers::from_here(bed.head().rails().into_iter().chain(&extruders));
         let last = Sample { at: now, nozzle_mm: [0.0; 3], filament_mm: 0.0, laid_mm: 0.0 };
-        let mut merger = Merger { bed, sources, extruders: extruders.len(), last, pushed_mm: 0.0 };
+        let mut merger = Merger { bed, followers, extruders, last, pushed_mm: 0.0 };
         merger.place(now);
         merger.pushed_mm = merger.last.filament_mm;
         merger.last.laid_mm = 0.0;
         merger
     }
 
-    /// Computes the present place from the axes' positions.
+    /// Computes the present place from the motors' positions.
     fn place(&mut self, at: Clock) {
-        let sources = &self.sources;
-        let position_mm = |axis: &Axis| {
-            sources.iter().find(|source| std::ptr::eq(&*source.axis, axis)).map_or(0.0, |source| source.mm)
-        };
-        let nozzle_mm = self.bed.head().nozzle_mm(position_mm);
-        let extruders = &sources[sources.len() - self.extruders..];
-        let filament_mm: f64 = extruders.iter().map(|source| source.mm).sum();
+        let nozzle_mm = self.bed.head().nozzle_mm(|rail| self.followers.place_mm(rail));
+        let filament_mm: f64 = self.extruders.iter().map(|rail| self.followers.place_mm(rail)).sum();
         let laid_mm = self.last.laid_mm + (filament_mm - self.pushed_mm).max(0.0);
         self.pushed_mm = self.pushed_mm.max(filament_mm);
         self.last = Sample { at, nozzle_mm, filament_mm, laid_mm };
     }
 
-    /// The place after the next step, and whether steps before it were overwritten. Steps of one instant are one.
-    fn next(&mut self) -> Option<(Sample, bool)> {
-        // One thread makes all steps, in the order of their instants. If a step is visible, those before it are too:
-        // also on an axis that had none when it was asked before.
-        loop {
-            let mut found = false;
-            for source in self.sources.iter_mut().filter(|source| source.next.is_none()) {
-                source.next = source.follower.next(Clock::from_ticks(u64::MAX >> 1));
-                found |= source.next.is_some();
-            }
-            if !found {
-                break;
-            }
-        }
-        let first = self.sources.iter().filter_map(|source| source.next).map(Motion::at).min()?;
-        let mut lost = false;
-        for source in &mut self.sources {
-            if let Some(motion) = source.next.take_if(|motion| motion.at() == first) {
-                source.mm = motion.mm();
-                lost |= matches!(motion, Motion::Lost(..));
-            }
-        }
+    /// The place after the next step, if it was not later than `until`, and whether steps before it were overwritten.
+    /// Steps of one instant are one.
+    fn next(&mut self, until: Clock) -> Option<(Sample, bool)> {
+        let (first, lost) = self.followers.next(until)?;
         // A step that comes out of order counts as the next one.
         self.place(first.max(Clock::from_ticks(self.last.at.ticks() + 1)));
         Some((self.last, lost))
@@ -182,16 +147,18 @@ pub struct Recorder {
     /// How far a line may be off along x, y, z and the filament.
     off_mm: [f64; 4],
     points_max: usize,
+    /// How long to wait for the steps of an instant. Boards do not make them in one order.
+    settles: Ticks,
     /// The height of the present layer: over the bed's plane, and over its shape.
     layer_mm: Option<[f64; 2]>,
     gaps: u64,
 }
 
 impl Recorder {
-    pub(crate) fn new(bed: Arc<Bed>, extruders: &[Arc<Axis>], now: Clock) -> Recorder {
-        let coarsest = |axes: &[&Arc<Axis>]| axes.iter().map(|axis| axis.step_mm()).fold(0.0, f64::max) * STEPS_OFF;
-        let head_mm = coarsest(&bed.head().axes());
-        let filament_mm = coarsest(&extruders.iter().collect::<Vec<_>>());
+    /// `settles` says how long to wait for the steps of an instant.
+    pub(crate) fn new(bed: Arc<Bed>, extruders: &[Arc<Axis>], settles: Ticks, now: Clock) -> Recorder {
+        let head_mm = bed.head().step_mm() * STEPS_OFF;
+        let filament_mm = extruders.iter().map(|axis| axis.step_mm()).fold(0.0, f64::max) * STEPS_OFF;
         let merger = Merger::new(bed, extruders, now);
         let start = merger.last;
         let mut recorder = Recorder {
@@ -200,6 +167,7 @@ impl Recorder {
             points: Vec::new(),
             off_mm: [head_mm, head_mm, head_mm, filament_mm],
             points_max: POINTS_MAX,
+            settles,
             layer_mm: None,
             gaps: 0,
         };
@@ -209,7 +177,12 @@ impl Recorder {
 
     /// Continues the path to the last step.
     pub fn read(&mut self, now: Clock) {
-        while let Some((sample, lost)) = self.merger.next() {
+        let until = match self.settles.0 {
+            // Steps of one board are in order, so none is missing before a step that is there.
+            0 => Clock::from_ticks(u64::MAX >> 1),
+            settles => now.earlier(settles.into()),
+        };
+        while let Some((sample, lost)) = self.merger.next(until) {
             if lost {
                 self.gaps += 1;
                 self.end_line();

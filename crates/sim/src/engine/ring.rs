@@ -6,13 +6,13 @@
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-use super::follower::{Follower, Motion};
-use super::physics::Axis;
+use super::follower::RailFollower;
+use super::motion::Rail;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks};
 
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RingConfig {
     /// The axis.
@@ -25,7 +25,7 @@ pub struct RingConfig {
 
 /// A mass on a spring. An axis moves the other end of the spring.
 pub(crate) struct Ring {
-    follower: Follower,
+    follower: RailFollower,
     /// Angular frequency in rad/s; the next field is the decay rate in 1/s.
     omega: f64,
     fade: f64,
@@ -41,19 +41,19 @@ pub(crate) struct Ring {
 
 impl Ring {
     /// Rings from the first step of the axis on.
-    pub(crate) fn new(axis: Arc<Axis>, config: &RingConfig, now: Clock) -> Ring {
-        Ring::of(Follower::new(axis.clone()), &axis, config, now)
+    pub(crate) fn new(rail: Arc<Rail>, config: &RingConfig, now: Clock) -> Ring {
+        Ring::of(RailFollower::new(rail.clone()), &rail, config, now)
     }
 
     /// Rings from the next step of the axis on.
-    fn from_here(axis: Arc<Axis>, config: &RingConfig, now: Clock) -> Ring {
-        Ring::of(Follower::from_here(axis.clone()), &axis, config, now)
+    fn from_here(rail: Arc<Rail>, config: &RingConfig, now: Clock) -> Ring {
+        Ring::of(RailFollower::from_here(rail.clone()), &rail, config, now)
     }
 
-    fn of(follower: Follower, axis: &Axis, config: &RingConfig, now: Clock) -> Ring {
+    fn of(follower: RailFollower, rail: &Rail, config: &RingConfig, now: Clock) -> Ring {
         let omega = TAU * config.hz;
         Ring {
-            axis_mm: axis.position_mm(),
+            axis_mm: rail.position_mm(),
             follower,
             omega,
             fade: config.damping_ratio * omega,
@@ -72,13 +72,12 @@ impl Ring {
 
     /// Continues to an instant, step by step.
     fn go(&mut self, until: Clock) {
-        while let Some(motion) = self.follower.next(until) {
-            let (Motion::Step(at, mm) | Motion::Lost(at, mm)) = motion;
+        while let Some((at, mm, lost)) = self.follower.next(until) {
             self.swing(at);
             self.ahead_mm -= mm - self.axis_mm;
             self.axis_mm = mm;
             self.stepped = at;
-            if matches!(motion, Motion::Lost(..)) {
+            if lost {
                 // The motion between is unknown, so the mass starts from rest.
                 (self.ahead_mm, self.mm_per_s) = (0.0, 0.0);
             }
@@ -131,9 +130,9 @@ impl RingWatch {
     /// How long the ringing behind a move counts.
     const RINGS: Ticks = Ticks::from_ms(100);
 
-    pub(crate) fn new(axis: Arc<Axis>, config: &RingConfig, now: Clock) -> RingWatch {
-        let name = axis.name.clone();
-        let ring = Ring::from_here(axis, config, now);
+    pub(crate) fn new(rail: Arc<Rail>, config: &RingConfig, now: Clock) -> RingWatch {
+        let name = rail.name.clone();
+        let ring = Ring::from_here(rail, config, now);
         RingWatch { axis: name, hz: config.hz, ring, at: now, greatest_mm: 0.0, sum_mm: 0.0, looks: 0 }
     }
 
@@ -180,6 +179,7 @@ impl RingWatch {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::motion::Axis;
 
     /// How far the head is off after a move of 11 mm that begins and ends at once, or with half of its speed for half a
     /// period (the ZV shaper of a head without damping).
@@ -188,7 +188,7 @@ mod tests {
         axis.set_enabled(true);
         axis.set_forward(true);
         let config = RingConfig { axis: "x".into(), hz: 50.0, damping_ratio: 0.01 };
-        let mut watch = RingWatch::new(axis.clone(), &config, Clock::EPOCH);
+        let mut watch = RingWatch::new(axis.rail().clone(), &config, Clock::EPOCH);
         let at = |seconds: f64| Clock::from_ticks((seconds * f64::from(CLOCK_FREQ)) as u64);
         let steps = 880;
         for n in 0..steps {
@@ -218,7 +218,7 @@ mod tests {
     fn an_axis_that_stands_was_not_seen_ringing() {
         let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
         let config = RingConfig { axis: "x".into(), hz: 50.0, damping_ratio: 0.01 };
-        let mut watch = RingWatch::new(axis, &config, Clock::EPOCH);
+        let mut watch = RingWatch::new(axis.rail().clone(), &config, Clock::EPOCH);
         watch.read(Clock::from_ticks(u64::from(CLOCK_FREQ)));
         assert_eq!(watch.seen(), None);
     }

@@ -23,6 +23,72 @@ pub(crate) const LATE_LIMIT: Ticks = Ticks::from_ms(400);
 /// How far a job may be ahead of the clock.
 const AHEAD: Ticks = Ticks::from_ms(1);
 
+/// How a board's clock differs from the printer's. It is fast and slow by turns, over hours, so the difference stays
+/// small: the program also compares its clock with the computer's.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Drift {
+    /// Radians for each tick.
+    speed: f64,
+    /// Highest difference in ticks.
+    most: f64,
+}
+
+impl Drift {
+    /// Longest difference of two clocks, in seconds.
+    const MOST_S: f64 = 0.05;
+
+    /// A clock that goes wrong by `ppm` millionths at most.
+    pub(crate) fn of(ppm: f64) -> Drift {
+        let most = if ppm == 0.0 { 0.0 } else { Drift::MOST_S * f64::from(CLOCK_FREQ) };
+        Drift { speed: ppm * 1e-6 / (Drift::MOST_S * f64::from(CLOCK_FREQ)), most }
+    }
+
+    fn off(self, at: Clock) -> i64 {
+        // The clock is wrong by `ppm` at the start.
+        ((at.ticks() as f64 * self.speed).sin() * self.most).round() as i64
+    }
+
+    /// The board's time at an instant of the printer.
+    pub(crate) fn of_board(self, at: Clock) -> Clock {
+        Clock::from_ticks(at.ticks().saturating_add_signed(self.off(at)))
+    }
+
+    /// The instant of the printer at a time of the board.
+    pub(crate) fn of_printer(self, board: Clock) -> Clock {
+        // The difference changes so slowly that two rounds find it to a tick.
+        let guess = |at: Clock| Clock::from_ticks(board.ticks().saturating_add_signed(-self.off(at)));
+        guess(guess(board))
+    }
+}
+
+/// The clock of a board.
+struct BoardClock {
+    clock: Arc<dyn TimeSource>,
+    drift: Drift,
+}
+
+impl TimeSource for BoardClock {
+    fn now(&self) -> Clock {
+        self.drift.of_board(self.clock.now())
+    }
+
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        self.drift.of_board(self.clock.instant_of(monotonic))
+    }
+
+    fn duration_of(&self, clock: Clock) -> Duration {
+        self.clock.duration_of(self.drift.of_printer(clock))
+    }
+
+    fn spin_until(&self, end: Clock) {
+        self.clock.spin_until(self.drift.of_printer(end));
+    }
+
+    fn step_ns(&self) -> u32 {
+        self.clock.step_ns()
+    }
+}
+
 thread_local! {
     /// The instant of the job that this thread runs; `None` if it runs no job.
     static JOB: Cell<Option<Clock>> = const { Cell::new(None) };
@@ -37,11 +103,14 @@ thread_local! {
 pub(crate) struct PrinterTime {
     clock: Arc<dyn TimeSource>,
     due: Due,
+    drift: Drift,
 }
 
 impl PrinterTime {
-    pub(crate) fn new(clock: Arc<dyn TimeSource>) -> PrinterTime {
-        PrinterTime { clock, due: Due::default() }
+    /// The time of a board whose clock drifts from this one.
+    pub(crate) fn new(clock: Arc<dyn TimeSource>, drift: Drift) -> PrinterTime {
+        let clock = if drift.most == 0.0 { clock } else { Arc::new(BoardClock { clock, drift }) };
+        PrinterTime { clock, due: Due::default(), drift }
     }
 
     /// The MCU sets this to the due time of the timer that it runs.
@@ -49,9 +118,9 @@ impl PrinterTime {
         self.due.clone()
     }
 
-    /// The instant of this thread's access to a line. Workers use lines in jobs only.
+    /// The printer's instant of this thread's access to a line. Workers use lines in jobs only.
     pub(crate) fn of_the_caller(&self) -> Clock {
-        JOB.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now())
+        self.drift.of_printer(JOB.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now()))
     }
 
     fn sleep_until(&self, end: Clock) {
@@ -103,7 +172,7 @@ mod tests {
     #[test]
     fn a_job_does_not_feel_how_late_the_computer_is() {
         let clock = VirtualClock::at(Clock::EPOCH);
-        let time = PrinterTime::new(Arc::new(clock.clone()));
+        let time = PrinterTime::new(Arc::new(clock.clone()), Drift::of(0.0));
         let ended = time.run_job(&mut || {
             for bit in 1..4 {
                 // Each wait ends much too late.
@@ -137,7 +206,7 @@ mod tests {
     #[test]
     fn a_job_takes_its_time() {
         let clock = Arc::new(Going(std::time::Instant::now()));
-        let time = PrinterTime::new(clock.clone());
+        let time = PrinterTime::new(clock.clone(), Drift::of(0.0));
         let mut end = Clock::EPOCH;
         let ended = time.run_job(&mut || {
             end = time.now() + Ticks::from_us(5500);
@@ -153,7 +222,7 @@ mod tests {
     #[test]
     fn a_timer_of_the_core_does_not_hold_back_the_time_of_a_worker() {
         let now = Clock::from_ticks(5_000);
-        let time = Arc::new(PrinterTime::new(Arc::new(VirtualClock::at(now))));
+        let time = Arc::new(PrinterTime::new(Arc::new(VirtualClock::at(now)), Drift::of(0.0)));
         time.due().set(Some(Clock::from_ticks(1_000)));
         let worker = std::thread::spawn({
             let time = time.clone();
@@ -164,5 +233,19 @@ mod tests {
         assert_eq!(time.now(), now, "but the MCU's clock goes on");
         time.due().set(None);
         assert_eq!(time.of_the_caller(), now);
+    }
+
+    #[test]
+    fn a_boards_clock_drifts_and_comes_back() {
+        let drift = Drift::of(20.0);
+        let at = |seconds: f64| Clock::from_ticks((seconds * f64::from(CLOCK_FREQ)) as u64);
+        let off = |seconds| drift.of_board(at(seconds)).since(at(seconds)) as f64 / f64::from(CLOCK_FREQ);
+        assert!((off(10.0) - 200e-6).abs() < 1e-6, "{}", off(10.0));
+        for seconds in [0.5, 100.0, 3e4, 1e6] {
+            assert!(off(seconds).abs() <= 0.05);
+            let back = drift.of_printer(drift.of_board(at(seconds)));
+            assert!(back.since(at(seconds)).abs() <= 1, "{seconds}");
+        }
+        assert_eq!(Drift::of(0.0).of_board(at(7.0)), at(7.0));
     }
 }

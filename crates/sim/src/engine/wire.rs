@@ -6,10 +6,12 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::motion::{Axis, Rail};
+use super::physics::{Fan, Heater, Lamp, Switch};
 use super::time::{PrinterTime, seconds};
-use crate::description::pin::PinName;
-use pinion_firmware::board::{Adc, Direction, Edge, Edges, Line, Pwm};
+use crate::description::pin::{PinName, on_board};
+use crate::description::sensor::Sensor;
+use pinion_firmware::board::{ADC_MAX, Adc, Bias, Direction, Edge, Edges, Line, PWM_MAX, Pwm};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
@@ -32,6 +34,8 @@ pub(crate) enum Kind {
     Miso,
     /// Send and receive with a serial port.
     Serial,
+    /// Anything: nothing is connected.
+    Free,
 }
 
 /// A part's end of a pin. "On" has the description's meaning: a high level, unless the pin is inverted.
@@ -70,9 +74,10 @@ pub(crate) trait Wire: Send + Sync {
         None
     }
 
-    /// A PWM channel gets another value, 0 to [`PWM_MAX`](pinion_firmware::board::PWM_MAX).
-    fn dim(&self, value: u16) {
-        let _ = value;
+    /// The hardware PWM of the pin gets another share of time, 0 to 1. `None` if the pin has no PWM.
+    fn dim(&self, share: f64, at: Clock) -> Option<()> {
+        let _ = (share, at);
+        None
     }
 
     /// The counts that an ADC reads at an analog pin. `noise` is a draw from a standard normal distribution.
@@ -113,6 +118,16 @@ impl WiredPin {
         WiredPin { name: pin.name.clone(), inverted: pin.inverted, wire }
     }
 
+    /// The same pin as its board knows it.
+    pub(crate) fn on_its_board(self) -> WiredPin {
+        WiredPin { name: on_board(&self.name).1.to_owned(), ..self }
+    }
+
+    /// The pin's PWM channel, if it has one.
+    pub(crate) fn pwm(&self, share: f64, at: Clock) -> Option<()> {
+        self.wire.dim(if self.inverted { 1.0 - share } else { share }, at)
+    }
+
     /// The error for a pin that is not of the `wanted` kind.
     pub(crate) fn is_no(&self, wanted: &str, reason: ShutdownReason) -> Shutdown {
         let is = match self.wire.kind() {
@@ -124,6 +139,7 @@ impl WiredPin {
             Kind::Mosi => "an SPI bus's data output",
             Kind::Miso => "an SPI bus's data input",
             Kind::Serial => "a serial port",
+            Kind::Free => "free",
         };
         let (name, wire) = (&self.name, self.wire.describe());
         Shutdown::because(reason, format!("pin {name} of the simulated printer is {is} ({wire}), no {wanted}"))
@@ -169,8 +185,12 @@ impl Line for SimLine {
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
         let kind = self.pin.wire.kind();
         match direction {
-            Direction::Output { level, .. } if matches!(kind, Kind::Output | Kind::Shared) => self.begin(level),
-            Direction::OpenDrain if matches!(kind, Kind::Output | Kind::Shared) => self.begin(true),
+            Direction::Output { level, .. } if matches!(kind, Kind::Output | Kind::Shared | Kind::Free) => {
+                self.begin(level);
+            }
+            Direction::OpenDrain if matches!(kind, Kind::Output | Kind::Shared | Kind::Free) => self.begin(true),
+            // Only the resistor decides the level of a free pin.
+            Direction::Input(bias) if kind == Kind::Free => self.begin(bias == Bias::PullUp),
             Direction::Output { .. } | Direction::OpenDrain => {
                 return Err(self.pin.is_no("output", reason::NOT_OUTPUT));
             }
@@ -196,12 +216,15 @@ impl Adc for SimAdc {
 }
 
 /// A hardware PWM channel.
-pub(crate) struct SimPwm(pub(crate) Arc<dyn Wire>);
+pub(crate) struct SimPwm {
+    pub(crate) pin: WiredPin,
+    pub(crate) clock: Arc<dyn TimeSource>,
+}
 
 impl Pwm for SimPwm {
     fn set(&mut self, value: u16) -> Result<(), Shutdown> {
-        self.0.dim(value);
-        Ok(())
+        let share = (f64::from(value) / f64::from(PWM_MAX)).min(1.0);
+        self.pin.pwm(share, self.clock.now()).ok_or_else(|| self.pin.is_no("hardware PWM channel", reason::PWM_CONFIG))
     }
 
     fn set_cycle(&mut self, _cycle: Ticks, value: u16) -> Result<(), Shutdown> {
@@ -303,8 +326,8 @@ impl Wire for DirectionPin {
     }
 }
 
-/// The enable input of an axis's driver.
-pub(crate) struct EnablePin(pub(crate) Arc<Axis>);
+/// The enable inputs of the drivers at one line.
+pub(crate) struct EnablePin(pub(crate) Vec<Arc<Axis>>);
 
 impl Wire for EnablePin {
     fn kind(&self) -> Kind {
@@ -312,16 +335,17 @@ impl Wire for EnablePin {
     }
 
     fn describe(&self) -> String {
-        format!("enable of axis {}", self.0.name)
+        let names: Vec<&str> = self.0.iter().map(|axis| axis.name.as_str()).collect();
+        format!("enable of axis {}", names.join(", "))
     }
 
     fn drive(&self, on: bool, _at: Clock) {
-        self.0.set_enabled(on);
+        self.0.iter().for_each(|axis| axis.set_enabled(on));
     }
 }
 
-/// An axis's endstop.
-pub(crate) struct EndstopPin(pub(crate) Arc<Axis>);
+/// A rail's endstop.
+pub(crate) struct EndstopPin(pub(crate) Arc<Rail>);
 
 impl Wire for EndstopPin {
     fn kind(&self) -> Kind {
@@ -352,6 +376,11 @@ impl Wire for HeaterPin {
     fn drive(&self, on: bool, at: Clock) {
         self.0.switch(on, at);
     }
+
+    fn dim(&self, share: f64, at: Clock) -> Option<()> {
+        self.0.power(share, at);
+        Some(())
+    }
 }
 
 /// A heater's thermistor.
@@ -367,7 +396,8 @@ impl Wire for ThermistorPin {
     }
 
     fn counts(&self, at: Clock, noise: f64) -> u16 {
-        self.0.thermistor.counts(self.0.at(at).sensor_celsius, noise * self.0.noise_counts)
+        let counts = |sensor: &Sensor| sensor.counts(self.0.at(at).sensor_celsius, noise * self.0.noise_counts);
+        self.0.sensor.as_ref().map_or(0, counts)
     }
 }
 
@@ -388,6 +418,14 @@ impl Wire for FanPin {
 
     fn drive(&self, on: bool, at: Clock) {
         self.0.switch(self.1, on, at);
+    }
+
+    fn dim(&self, share: f64, at: Clock) -> Option<()> {
+        match self.1 {
+            Switch::Power => self.0.power(share, at),
+            Switch::Enable => self.0.switch(Switch::Enable, share > 0.0, at),
+        }
+        Some(())
     }
 }
 
@@ -427,6 +465,11 @@ impl Wire for LampPin {
     fn drive(&self, on: bool, at: Clock) {
         self.0.switch(on, at);
     }
+
+    fn dim(&self, share: f64, at: Clock) -> Option<()> {
+        self.0.dim(share, at);
+        Some(())
+    }
 }
 
 /// An input that stays at one level.
@@ -446,5 +489,48 @@ impl Wire for FixedInput {
 
     fn sense(&self, _driven: bool, _at: Clock) -> bool {
         self.on
+    }
+}
+
+/// A pin with nothing connected.
+pub(crate) struct FreePin;
+
+impl Wire for FreePin {
+    fn kind(&self) -> Kind {
+        Kind::Free
+    }
+
+    fn describe(&self) -> String {
+        "nothing is connected".into()
+    }
+
+    fn dim(&self, _share: f64, _at: Clock) -> Option<()> {
+        Some(())
+    }
+
+    fn counts(&self, _at: Clock, _noise: f64) -> u16 {
+        ADC_MAX / 2
+    }
+}
+
+/// An analog pin at a fixed level.
+pub(crate) struct FixedAnalog {
+    pub(crate) name: String,
+    pub(crate) fraction: f64,
+}
+
+impl Wire for FixedAnalog {
+    fn kind(&self) -> Kind {
+        Kind::Analog
+    }
+
+    fn describe(&self) -> String {
+        self.name.clone()
+    }
+
+    fn counts(&self, _at: Clock, _noise: f64) -> u16 {
+        let max = f64::from(ADC_MAX);
+        // The clamp keeps the value in the range of a u16, so the cast loses nothing.
+        (self.fraction * max).round().clamp(0.0, max) as u16
     }
 }

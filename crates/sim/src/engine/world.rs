@@ -6,7 +6,8 @@
 use std::sync::Arc;
 
 use super::look::Look;
-use super::physics::{Axis, Fan, Heater, Lamp};
+use super::motion::{Axis, Rail};
+use super::physics::{Fan, Heater, Lamp};
 use super::ring::RingConfig;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::Clock;
@@ -27,13 +28,15 @@ pub(crate) type OpenThermometer = Box<dyn Fn() -> Box<dyn Thermometer> + Send + 
 #[derive(Default)]
 pub(crate) struct World {
     pub(crate) axes: Vec<Arc<Axis>>,
+    /// The rails without a motor of their own.
+    pub(crate) carriages: Vec<Arc<Rail>>,
     /// The axes that feed filament to hot ends.
     pub(crate) extruders: Vec<Arc<Axis>>,
     pub(crate) heaters: Vec<Arc<Heater>>,
     pub(crate) fans: Vec<Arc<Fan>>,
     pub(crate) lamps: Vec<Arc<Lamp>>,
     /// What rings on an axis.
-    pub(crate) rings: Vec<(Arc<Axis>, RingConfig)>,
+    pub(crate) rings: Vec<(Arc<Rail>, RingConfig)>,
     pub(crate) sights: Vec<Arc<dyn Sight>>,
     /// By their serial numbers.
     pub(crate) thermometers: Vec<(String, OpenThermometer)>,

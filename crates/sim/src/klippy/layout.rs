@@ -27,12 +27,17 @@ impl<'a> Layout<'a> {
 
     /// Whether klippy moves a head over the bed.
     pub(crate) fn has_head(&self) -> bool {
-        self.kinematics != Kinematics::None
+        self.has_rails() || matches!(self.kinematics, Kinematics::Delta(_))
+    }
+
+    /// Whether klippy's sections for x, y and z are printed.
+    pub(crate) fn has_rails(&self) -> bool {
+        self.kinematics.has_gantry() && self.kinematics != Kinematics::Generic
     }
 
     /// Whether an axis has klippy's keys for a homed axis.
     pub(crate) fn is_homed(&self, axis: &str) -> bool {
-        self.kinematics.has_gantry() && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
+        self.has_rails() && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
     }
 
     pub(crate) fn is_dual_carriage(&self, axis: &str) -> bool {
@@ -48,7 +53,7 @@ impl<'a> Layout<'a> {
     /// The section of an axis's stepper.
     pub(crate) fn stepper(&self, axis: &str) -> String {
         let is_of = |rail: &&str| self.printer.motors(rail).any(|motor| motor.name == axis);
-        if self.kinematics.rails().iter().any(is_of) {
+        if self.has_head() && self.kinematics.rails().iter().any(is_of) {
             format!("stepper_{axis}")
         } else if self.is_hot_end(axis) || self.is_dual_carriage(axis) {
             axis.to_owned()

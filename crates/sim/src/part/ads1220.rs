@@ -12,7 +12,7 @@
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::load_cell::{Cell, CellConfig};
 use super::ready::{Conversions, ReadyLine, ReadyPin};
@@ -42,7 +42,7 @@ const RATES: [[f64; 3]; 7] = [
 ];
 
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ads1220Config {
     /// Its SPI bus.

@@ -18,7 +18,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
@@ -83,7 +83,7 @@ const G_MM_PER_S2: f64 = 9806.65;
 const DELAY_TICKS: u64 = Ticks::from_ms(100).0 as u64;
 
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Adxl345Config {
     /// Its SPI bus.
@@ -127,7 +127,7 @@ impl Part for Adxl345Config {
         check(whose, "noise_lsb", self.noise_lsb, Bound::NotNegative)?;
         for (key, ring) in self.rings() {
             let Some(ring) = ring else { continue };
-            printer.check_axis(whose, &ring.axis)?;
+            printer.check_rail(whose, &ring.axis)?;
             check(whose, key, ring.hz, Bound::AboveZero)?;
             if !(1e-6..0.99).contains(&ring.damping_ratio) {
                 let cause = format!("a damping_ratio of {} does not ring", ring.damping_ratio);
@@ -141,11 +141,11 @@ impl Part for Adxl345Config {
         let now = workshop.clock.now();
         let rings = self.rings().map(|(_, ring)| {
             let ring = ring?;
-            Some(Ring::new(workshop.axis(&ring.axis)?, ring, now))
+            Some(Ring::new(workshop.rail(&ring.axis)?, ring, now))
         });
         for ring in self.rings().into_iter().filter_map(|(_, ring)| ring) {
-            let axis = workshop.axis(&ring.axis);
-            workshop.world.rings.extend(axis.map(|axis| (axis, ring.clone())));
+            let rail = workshop.rail(&ring.axis);
+            workshop.world.rings.extend(rail.map(|rail| (rail, ring.clone())));
         }
         let noise = workshop.noise(self);
         workshop.solder_spi(self, Adxl345::new(self, rings, noise, workshop.clock.clone()));
@@ -427,7 +427,7 @@ impl SpiChip for Adxl345 {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use pinion_firmware::time::VirtualClock;
     use std::f64::consts::TAU;
 
@@ -448,7 +448,7 @@ mod tests {
             axis.set_enabled(true);
             axis.set_forward(true);
             let ring = RingConfig { axis: "x".into(), hz: X_HZ, damping_ratio: DAMPING };
-            let rings = [Some(Ring::new(axis.clone(), &ring, clock.now())), None, None];
+            let rings = [Some(Ring::new(axis.rail().clone(), &ring, clock.now())), None, None];
             let config = Adxl345Config {
                 bus: "spidev1.0".into(),
                 select_pin: None,

@@ -13,7 +13,7 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 mod a1333;
 mod as5047d;
@@ -37,7 +37,7 @@ use crate::klippy::layout::{FULL_STEPS, Layout};
 use crate::klippy::sections::Sections;
 
 /// The sensor's type.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AngleChip {
     /// Allegro, with 15 bits.
@@ -65,7 +65,7 @@ impl AngleChip {
 }
 
 /// The sensor's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AngleConfig {
     /// The sensor's type.
@@ -134,7 +134,7 @@ mod tests {
     use super::shaft::{crc8, even_parity};
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use crate::engine::spi::SpiChip;
     use pinion_firmware::time::{Clock, Ticks, VirtualClock};
     use std::sync::Arc;

@@ -16,7 +16,7 @@
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, check_offsets};
@@ -43,7 +43,7 @@ const TRAIN_S: f64 = 0.050;
 const SELF_TEST_ROUNDS: f64 = 10.0;
 
 /// The probe's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BltouchConfig {
     /// The input for the servo's pulses.
@@ -70,7 +70,7 @@ fn default_move_s() -> f64 {
 }
 
 /// The place where a pin is stuck.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Jam {
     /// The pin does not go down.
@@ -372,7 +372,7 @@ impl Wire for SensorPin {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use pinion_firmware::time::CLOCK_FREQ;
 
     /// The probe over a flat bed, with its nozzle at 12 mm.

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
@@ -20,7 +20,7 @@ use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::TimeSource;
 
 /// The thermometer's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ds18b20Config {
     /// Its name in klippy.

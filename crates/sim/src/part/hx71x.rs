@@ -17,7 +17,7 @@
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::load_cell::{Cell, CellConfig};
 use super::workshop::{Part, Socket, Workshop};
@@ -39,7 +39,7 @@ const SAMPLE_BITS: u64 = 24;
 const SETTLING: u64 = 4;
 
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Hx71xConfig {
     /// Which of the two it is.
@@ -57,7 +57,7 @@ pub struct Hx71xConfig {
 }
 
 /// The two chips.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Hx71xChip {
     /// 10 or 80 samples a second.
@@ -334,7 +334,7 @@ mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
     use crate::engine::bed::Bed;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use pinion_firmware::time::VirtualClock;
 
     struct Bench {

@@ -17,7 +17,7 @@
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use super::workshop::{Part, Socket, Workshop};
@@ -93,7 +93,7 @@ const REGISTERS: &[(u8, u16, u16)] = &[
 ];
 
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ldc1612Config {
     /// Its I2C bus.
@@ -392,7 +392,7 @@ impl I2cChip for Ldc1612 {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use pinion_firmware::time::VirtualClock;
 
     struct Bench {

@@ -4,7 +4,7 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check};
@@ -13,7 +13,7 @@ use crate::engine::noise::Noise;
 use crate::klippy::sections::Sections;
 
 /// The cell's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellConfig {
     /// The force for each millimeter that the nozzle is below the bed's surface.

@@ -4,7 +4,7 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::Trouble;
@@ -12,7 +12,7 @@ use crate::description::pin::PinName;
 use crate::engine::spi::SpiChip;
 
 /// The wire's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LoopbackConfig {
     /// Its SPI bus.

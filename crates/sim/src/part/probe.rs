@@ -4,7 +4,7 @@
 
 #![forbid(unsafe_code)]
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Trouble, check_offsets};
@@ -17,7 +17,7 @@ use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The probe's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProbeConfig {
     /// High while the probe touches the bed.
@@ -89,7 +89,7 @@ impl Wire for Probe {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use crate::engine::physics::Axis;
+    use crate::engine::motion::Axis;
     use std::sync::Arc;
 
     #[test]

@@ -4,9 +4,9 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Trouble, wrong};
@@ -17,11 +17,10 @@ use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::board::PWM_MAX;
 use pinion_firmware::time::Clock;
 
 /// The channel's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PwmChannelConfig {
     /// For example `laser`.
@@ -47,7 +46,7 @@ impl Part for PwmChannelConfig {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
-        let channel = Arc::new(PwmChannel { name: self.name.clone(), value: AtomicU32::new(0) });
+        let channel = Arc::new(PwmChannel { name: self.name.clone(), share: AtomicU64::new(0) });
         workshop.wire_shared(Some(&self.pin), channel.clone());
         workshop.show(channel);
         Ok(())
@@ -64,8 +63,8 @@ impl Part for PwmChannelConfig {
 
 struct PwmChannel {
     name: String,
-    /// 0 to [`PWM_MAX`].
-    value: AtomicU32,
+    /// The share of time that it is on, in bits.
+    share: AtomicU64,
 }
 
 impl Wire for PwmChannel {
@@ -77,8 +76,9 @@ impl Wire for PwmChannel {
         format!("hardware PWM of {}", self.name)
     }
 
-    fn dim(&self, value: u16) {
-        self.value.store(value.into(), Ordering::Relaxed);
+    fn dim(&self, share: f64, _at: Clock) -> Option<()> {
+        self.share.store(share.to_bits(), Ordering::Relaxed);
+        Some(())
     }
 }
 
@@ -88,20 +88,22 @@ impl Sight for PwmChannel {
     }
 
     fn look(&self, _now: Clock) -> Look {
-        Look::Power { share: f64::from(self.value.load(Ordering::Relaxed)) / f64::from(PWM_MAX) }
+        Look::Power { share: f64::from_bits(self.share.load(Ordering::Relaxed)) }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pinion_firmware::board::PWM_MAX;
 
     #[test]
     fn a_channel_shows_the_percent_that_klippy_was_told() {
-        let channel = PwmChannel { name: "laser".into(), value: AtomicU32::new(0) };
+        let channel = PwmChannel { name: "laser".into(), share: AtomicU64::new(0) };
         for percent in 0..=100 {
             // The value that klippy computes (klippy/mcu.py).
-            channel.dim((f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16);
+            let value = (f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16;
+            channel.dim(f64::from(value) / f64::from(PWM_MAX), Clock::EPOCH);
             assert_eq!(channel.look(Clock::EPOCH).to_string(), format!("{percent} %"));
         }
     }

@@ -10,7 +10,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
@@ -26,7 +26,7 @@ use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The servo's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ServoConfig {
     /// For example `arm`.

@@ -9,20 +9,20 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::physics::Axis;
+use crate::engine::motion::Axis;
 use crate::engine::wire::{Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The spool's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpoolConfig {
     /// For example `filament`.

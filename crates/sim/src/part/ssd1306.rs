@@ -15,7 +15,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
@@ -38,7 +38,7 @@ const ROWS: u8 = 64;
 const ADDRESS: u8 = 0x3c;
 
 /// The display's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ssd1306Config {
     /// For example `display`.

@@ -11,7 +11,7 @@
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
@@ -24,7 +24,7 @@ use crate::klippy::sections::Sections;
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 
 /// A converter's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ThermocoupleConfig {
     /// For example `nozzle`.
@@ -63,7 +63,7 @@ fn default_reference_ohm() -> f64 {
 }
 
 /// The chips.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Converter {
     /// Thermocouple, 14 bits, faults in the word.
@@ -77,7 +77,7 @@ pub enum Converter {
 }
 
 /// The faults that a sensor's wires can have.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SensorFault {
     /// A wire is off.
@@ -404,7 +404,7 @@ mod tests {
             let mut printer = DefaultPrinter::read();
             let heater = &mut printer.heaters[0];
             (heater.ambient_celsius, heater.start_celsius) = (celsius, Some(celsius));
-            let heater = Heater::new(heater, heater.thermistor().unwrap(), 0.0, clock.now());
+            let heater = Heater::new(heater, heater.sensor().unwrap(), 0.0, clock.now());
             let config = ThermocoupleConfig {
                 name: "nozzle".into(),
                 chip,

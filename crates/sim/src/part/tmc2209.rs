@@ -13,9 +13,9 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::trinamic::{
     Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
@@ -26,7 +26,7 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::physics::Axis;
+use crate::engine::motion::Axis;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
@@ -53,6 +53,7 @@ const PWM_AUTO: u8 = 0x72;
 const OTP: u32 = 0x0f;
 /// IOIN: VERSION, and the level of PDN_UART, which is high after a message.
 const VERSION: u32 = 0x21 << 24;
+const VERSION_2208: u32 = 0x20 << 24;
 const PDN_UART: u32 = 1 << 6;
 const GCONF_EN_SPREADCYCLE: u32 = 1 << 2;
 const GCONF_SHAFT: u32 = 1 << 3;
@@ -94,10 +95,39 @@ const REGISTERS: &[Register] = &[
     Register(PWM_AUTO, R, 24, 0), // computed
 ];
 
+/// The registers of a TMC2208 (data sheet rev. 1.13, "Register Map").
+const REGISTERS_2208: &[Register] = &[
+    Register(GCONF, RW, 10, 0x0000_0101),
+    Register(GSTAT, C, 3, 0x0000_0001),
+    Register(IFCNT, R, 8, 0), // computed
+    Register(SLAVECONF, W, 12, 0),
+    Register(0x04, W, 16, 0),    // OTP_PROG: is done in a factory, not here
+    Register(0x05, R, 24, OTP),  // OTP_READ
+    Register(IOIN, R, 32, 0),    // computed
+    Register(0x07, RW, 10, OTP), // FACTORY_CONF: starts as the OTP has it
+    Register(IHOLD_IRUN, W, 20, 0x0001_1f10),
+    Register(0x11, W, 8, 20),  // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, W, 20, 0),
+    Register(0x22, W, 24, 0),     // VACTUAL
+    Register(MSCNT, R, 10, 0),    // computed
+    Register(MSCURACT, R, 25, 0), // computed
+    Register(CHOPCONF, RW, 32, 0x1000_0053),
+    Register(DRV_STATUS, R, 32, 0), // computed
+    Register(PWMCONF, RW, 32, 0xc10d_0024),
+    Register(0x71, R, 25, 0),     // PWM_SCALE
+    Register(PWM_AUTO, R, 24, 0), // computed
+];
+
+/// A driver TMC2209.
+pub type Tmc2209Config = UartDriverConfig<2209>;
+/// A driver TMC2208, TMC2220, TMC2224 or TMC2225. It has no address, no StallGuard and no CoolStep.
+pub type Tmc2208Config = UartDriverConfig<2208>;
+
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Tmc2209Config {
+pub struct UartDriverConfig<const MODEL: u16> {
     /// PDN_UART, the wire for both directions; with `tx_pin` it is the board's receiving end.
     pub uart_pin: Option<PinName>,
     /// The serial port at PDN_UART, in place of `uart_pin`. Drivers with other addresses may share it.
@@ -111,16 +141,26 @@ pub struct Tmc2209Config {
     pub axis: String,
     /// DIAG: high while the motor is stalled.
     pub diag_pin: Option<PinName>,
+    /// SG_RESULT of a free motor. A motor with full load has 0. SGTHRS has to be below half of it.
+    #[serde(default = "default_sg_free")]
+    pub sg_free: u32,
 }
 
-impl Part for Tmc2209Config {
+fn default_sg_free() -> u32 {
+    SG_FREE
+}
+
+impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
     fn name(&self) -> String {
-        format!("tmc2209 {}", self.axis)
+        format!("tmc{MODEL} {}", self.axis)
     }
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
-        let pins = [("tx_pin", self.tx_pin.as_ref()), ("diag_pin", self.diag_pin.as_ref())];
-        [("uart_pin", self.uart_pin.as_ref())].into_iter().chain(pins).collect()
+        vec![("diag_pin", self.diag_pin.as_ref())]
+    }
+
+    fn uart_pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("uart_pin", self.uart_pin.as_ref()), ("tx_pin", self.tx_pin.as_ref())]
     }
 
     fn socket(&self) -> Option<Socket<'_>> {
@@ -128,8 +168,12 @@ impl Part for Tmc2209Config {
     }
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
-        if self.address > 3 {
-            return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 3");
+        let (most, range) = if MODEL == 2209 { (3, "0 to 3") } else { (0, "0") };
+        if self.address > most {
+            return wrong(whose, "address", &format!("{} is none", self.address), &format!("give {range}"));
+        }
+        if !(1..=511).contains(&self.sg_free) {
+            return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give 1 to 511");
         }
         match (&self.uart_pin, &self.uart_port) {
             (None, None) => return wrong(whose, "uart_pin", "it has none", "add it, or `uart_port`"),
@@ -150,13 +194,19 @@ impl Part for Tmc2209Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
-        let chip = Tmc2209::new(&self.name(), self.address, axis);
+        let chip = Tmc2209::new(&self.name(), MODEL, (self.address, self.sg_free), axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
         if self.uart_port.is_some() {
             workshop.solder_serial(self, PortUart(Box::new(chip)));
             return Ok(());
         }
+        let line = self.uart_pin.as_ref().map_or("", |pin| &pin.name);
+        if let Some((_, uart)) = workshop.uarts.iter().find(|(name, _)| name == line) {
+            uart.lock().unwrap_or_else(PoisonError::into_inner).solder(Box::new(chip));
+            return Ok(());
+        }
         let uart = Arc::new(Mutex::new(Uart::new(Box::new(chip))));
+        workshop.uarts.push((line.to_owned(), uart.clone()));
         let end = |role| UartPin { name: self.name(), role, uart: uart.clone() };
         match &self.tx_pin {
             None => workshop.wire(self.uart_pin.as_ref(), end(Role::Both)),
@@ -169,15 +219,17 @@ impl Part for Tmc2209Config {
     }
 
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
-        cfg.section(format_args!("tmc2209 {}", layout.stepper(&self.axis)));
+        cfg.section(format_args!("tmc{MODEL} {}", layout.stepper(&self.axis)));
         may_be_left_out(cfg);
         cfg.key_if("uart_pin", self.uart_pin.as_ref());
         cfg.key_if("uart_pin", self.uart_port.as_ref());
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
-        cfg.key("uart_address", self.address);
+        if MODEL == 2209 {
+            cfg.key("uart_address", self.address);
+        }
         cfg.key("run_current", 0.8);
         cfg.key("sense_resistor", 0.11);
-        if let Some(pin) = &self.diag_pin {
+        if let Some(pin) = self.diag_pin.as_ref().filter(|_| MODEL == 2209) {
             cfg.key("diag_pin", pin);
             offer_sensorless_homing(cfg, layout, "tmc2209", &self.axis, ("driver_SGTHRS", SGTHRS_FOR_HOMING));
         }
@@ -185,7 +237,10 @@ impl Part for Tmc2209Config {
 }
 
 struct Tmc2209 {
+    model: u16,
     address: u8,
+    /// SG_RESULT of the free motor.
+    sg_free: u32,
     motor: Motor,
     diag: Arc<StallOutput>,
     registers: Registers,
@@ -195,10 +250,11 @@ struct Tmc2209 {
 
 impl Tmc2209 {
     /// The driver of an axis, at power-up.
-    fn new(name: &str, address: u8, axis: Arc<Axis>) -> Tmc2209 {
-        let registers = Registers::new(REGISTERS);
-        let diag = Arc::new(StallOutput::new(name.to_owned(), axis.clone(), stall_rule(&registers, 0)));
-        let mut chip = Tmc2209 { address, motor: Motor::new(axis), diag, registers, written: 0 };
+    fn new(name: &str, model: u16, (address, sg_free): (u8, u32), axis: Arc<Axis>) -> Tmc2209 {
+        let registers = Registers::new(if model == 2208 { REGISTERS_2208 } else { REGISTERS });
+        let rule = stall_rule(&registers, sg_free, 0);
+        let diag = Arc::new(StallOutput::new(name.to_owned(), axis.clone(), rule));
+        let mut chip = Tmc2209 { model, address, sg_free, motor: Motor::new(axis), diag, registers, written: 0 };
         chip.set_up();
         chip
     }
@@ -208,11 +264,14 @@ impl Tmc2209 {
         let mres = if self.registers.is_set(GCONF, GCONF_MSTEP_REG_SELECT) {
             self.registers.get(CHOPCONF) >> 24 & 0xf
         } else {
-            // 8, 32, 64 and 16 microsteps by MS1 and MS2.
-            [5, 3, 2, 4][usize::from(self.address & 3)]
+            // 8, 32, 64 and 16 microsteps by MS1 and MS2; 8, 2, 4 and 16 of a TMC2208.
+            let by_pins = if self.model == 2208 { [5, 7, 6, 4] } else { [5, 3, 2, 4] };
+            by_pins[usize::from(self.address & 3)]
         };
         self.motor.set_up(mres, self.registers.is_set(GCONF, GCONF_SHAFT));
-        self.diag.set(stall_rule(&self.registers, self.motor.mres()));
+        let mut rule = stall_rule(&self.registers, self.sg_free, self.motor.mres());
+        rule.least_load = rule.least_load.filter(|_| self.model == 2209);
+        self.diag.set(rule);
     }
 
     /// The value that a host reads at this instant.
@@ -225,11 +284,12 @@ impl Tmc2209 {
                 let [off, step, dir] = [!axis.is_enabled(), axis.is_stepped(), axis.is_dir_high()].map(u32::from);
                 let [ms1, ms2] = [self.address & 1, self.address >> 1].map(u32::from);
                 let diag = u32::from(self.diag.is_stalled(now));
-                VERSION | PDN_UART | dir << 9 | step << 7 | diag << 4 | ms2 << 3 | ms1 << 2 | off
+                let version = if self.model == 2208 { VERSION_2208 } else { VERSION };
+                version | PDN_UART | dir << 9 | step << 7 | diag << 4 | ms2 << 3 | ms1 << 2 | off
             }
             TSTEP => self.motor.tstep(now),
-            SG_RESULT if stands => 0,
-            SG_RESULT => SG_FREE - SG_FREE * self.motor.load(now) / FULL_LOAD,
+            SG_RESULT if stands || self.model == 2208 => 0,
+            SG_RESULT => self.sg_free - self.sg_free * self.motor.load(now) / FULL_LOAD,
             MSCNT => self.motor.mscnt(),
             MSCURACT => self.motor.currents(&Wave::DEFAULT),
             DRV_STATUS => {
@@ -278,11 +338,11 @@ impl UartChip for Tmc2209 {
 
 /// When DIAG reports a stall: SG_RESULT is at most twice SGTHRS, and the velocity is from TCOOLTHRS up to the start of
 /// SpreadCycle.
-fn stall_rule(registers: &Registers, mres: u32) -> StallRule {
-    let fall = SG_FREE.saturating_sub(2 * registers.get(SGTHRS));
+fn stall_rule(registers: &Registers, sg_free: u32, mres: u32) -> StallRule {
+    let fall = sg_free.saturating_sub(2 * registers.get(SGTHRS));
     let stealth = !registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
     StallRule {
-        least_load: stealth.then_some((fall * FULL_LOAD).div_ceil(SG_FREE)),
+        least_load: stealth.then_some((fall * FULL_LOAD).div_ceil(sg_free)),
         fastest: registers.get(TPWMTHRS),
         slowest: registers.get(TCOOLTHRS),
         mres,
@@ -310,7 +370,12 @@ mod tests {
     impl Bench {
         fn new(address: u8) -> Bench {
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[1]));
-            let uart = Arc::new(Mutex::new(Uart::new(Box::new(Tmc2209::new("tmc2209 y", address, axis.clone())))));
+            let uart = Arc::new(Mutex::new(Uart::new(Box::new(Tmc2209::new(
+                "tmc2209 y",
+                2209,
+                (address, SG_FREE),
+                axis.clone(),
+            )))));
             let pin = UartPin { name: "tmc2209 y".into(), role: Role::Both, uart };
             pin.settle(true, Clock::EPOCH);
             Bench { axis, pin, bit: BIT, now: Clock::EPOCH + Ticks(100_000) }
@@ -383,6 +448,20 @@ mod tests {
                 self.axis.edge(false, self.now);
             }
         }
+    }
+
+    #[test]
+    fn chips_with_other_addresses_share_the_wire() {
+        let mut bench = Bench::new(2);
+        let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
+        let other = Tmc2209::new("other", 2208, (0, SG_FREE), axis);
+        bench.pin.uart.lock().unwrap().solder(Box::new(other));
+        assert_eq!(bench.read(IOIN) >> 24, 0x21);
+        bench.message(&[0xf5, 0, IOIN]);
+        let (_, bytes) = bench.receive().expect("an answer");
+        assert_eq!(bytes[3], 0x20, "a TMC2208");
+        bench.message(&[0xf5, 1, IOIN]);
+        assert!(bench.receive().is_none());
     }
 
     /// The data sheet's CRC and klippy agree on this example: a read of IFCNT.

@@ -7,28 +7,28 @@
 //! is reset.
 //!
 //! Simulated: every register with its access and its reset value, the microstep counter and the currents of the wave
-//! table, standstill and the time between steps, the inputs, StallGuard and DIAG1 (`trinamic.rs`). The [`Axis`]
+//! table, standstill and the time between steps, the inputs, StallGuard, DIAG0 and DIAG1 (`trinamic.rs`). The [`Axis`]
 //! simulates the motor. It turns whether or not the chip's power stage is on, and for any microstep setting. So a host
 //! can omit the chip's section. Only one setting affects the axis: which edges are steps (DEDGE).
 //!
-//! Not simulated: DIAG0, CoolStep, temperatures and faults, the automatic tuning of StealthChop, and the ramp generator
+//! Not simulated: CoolStep, temperatures and faults, the automatic tuning of StealthChop, and the ramp generator
 //! and encoder (their registers keep what is written).
 
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::trinamic::{
     Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
     offer_sensorless_homing,
 };
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::Trouble;
+use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::physics::Axis;
+use crate::engine::motion::Axis;
 use crate::engine::spi::SpiChip;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -61,11 +61,14 @@ const PWM_AUTO: u8 = 0x72;
 const OTP: u32 = 0x0f;
 /// IOIN: VERSION, and SD_MODE, which is wired high for the step and direction mode.
 const VERSION: u32 = 0x30 << 24;
+const VERSION_2130: u32 = 0x11 << 24;
+const VERSION_2240: u32 = 0x40 << 24;
 const SD_MODE: u32 = 1 << 6;
 const GCONF_EN_PWM_MODE: u32 = 1 << 2;
 const GCONF_SHAFT: u32 = 1 << 4;
-const GCONF_DIAG1_STALL: u32 = 1 << 8;
-const GCONF_DIAG1_PUSHPULL: u32 = 1 << 13;
+/// Of DIAG0 and DIAG1.
+const GCONF_DIAG_STALL: [u32; 2] = [1 << 7, 1 << 8];
+const GCONF_DIAG_PUSHPULL: [u32; 2] = [1 << 12, 1 << 13];
 const GSTAT_DRV_ERR: u32 = 1 << 1;
 const CHOPCONF_DEDGE: u32 = 1 << 29;
 const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
@@ -144,10 +147,104 @@ const REGISTERS: &[Register] = &[
     Register(0x73, R, 20, 0),     // LOST_STEPS: counts in DcStep mode only
 ];
 
+/// The registers of a TMC2130 (data sheet rev. 1.15, "Register Mapping").
+const REGISTERS_2130: &[Register] = &[
+    Register(GCONF, RW, 18, 0),
+    Register(GSTAT, C, 3, 0x0000_0001),
+    Register(IOIN, R, 32, 0), // computed
+    Register(IHOLD_IRUN, W, 20, 0),
+    Register(0x11, W, 8, 0),   // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, W, 20, 0),
+    Register(TCOOLTHRS, W, 20, 0),
+    Register(0x15, W, 20, 0),  // THIGH
+    Register(0x2d, RW, 32, 0), // XDIRECT
+    Register(0x33, W, 23, 0),  // VDCMIN
+    Register(MSLUT, W, 32, 0xaaaa_b554),
+    Register(0x61, W, 32, 0x4a95_54aa), // MSLUT1 to 7
+    Register(0x62, W, 32, 0x2449_2929),
+    Register(0x63, W, 32, 0x1010_4222),
+    Register(0x64, W, 32, 0xfbff_ffff),
+    Register(0x65, W, 32, 0xb5bb_777d),
+    Register(0x66, W, 32, 0x4929_5556),
+    Register(0x67, W, 32, 0x0040_4222),
+    Register(MSLUTSEL, W, 32, 0xffff_8056),
+    Register(MSLUTSTART, W, 24, 0x00f7_0000),
+    Register(MSCNT, R, 10, 0),    // computed
+    Register(MSCURACT, R, 25, 0), // computed
+    Register(CHOPCONF, RW, 32, 0),
+    Register(COOLCONF, W, 25, 0),
+    Register(0x6e, W, 24, 0),       // DCCTRL
+    Register(DRV_STATUS, R, 32, 0), // computed
+    Register(PWMCONF, W, 22, 0x0005_0480),
+    Register(0x71, R, 8, 0),  // PWM_SCALE
+    Register(0x72, W, 2, 0),  // ENCM_CTRL
+    Register(0x73, R, 20, 0), // LOST_STEPS: counts in DcStep mode only
+];
+
+/// The registers of a TMC2240 (Analog Devices, TMC2240, rev. 2: "Register Map").
+const REGISTERS_2240: &[Register] = &[
+    Register(GCONF, RW, 18, 0x0000_0008),
+    Register(GSTAT, C, 5, 0x0000_0001),
+    Register(0x02, R, 8, 0),             // IFCNT: of the UART, which is not in use
+    Register(0x03, W, 12, 0),            // NODECONF
+    Register(IOIN, R, 32, 0),            // computed
+    Register(0x0a, RW, 22, 0x0000_0020), // DRV_CONF
+    Register(0x0b, RW, 8, 0),            // GLOBAL_SCALER
+    Register(IHOLD_IRUN, RW, 28, 0x0407_0a03),
+    Register(0x11, RW, 8, 10), // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, RW, 20, 0),
+    Register(TCOOLTHRS, RW, 20, 0),
+    Register(0x15, RW, 20, 0),           // THIGH
+    Register(0x2d, RW, 32, 0),           // DIRECT_MODE
+    Register(0x38, RW, 11, 0),           // ENCMODE
+    Register(0x39, RW, 32, 0),           // X_ENC
+    Register(0x3a, W, 32, 0x0001_0000),  // ENC_CONST
+    Register(0x3b, C, 1, 0),             // ENC_STATUS
+    Register(0x3c, R, 32, 0),            // ENC_LATCH
+    Register(0x50, R, 29, ADC_24_V),     // ADC_VSUPPLY_AIN
+    Register(0x51, R, 29, ADC_35_C),     // ADC_TEMP
+    Register(0x52, RW, 29, 0x0b92_0f25), // OTW_OV_VTH
+    Register(MSLUT, RW, 32, 0xaaaa_b554),
+    Register(0x61, RW, 32, 0x4a95_54aa), // MSLUT1 to 7
+    Register(0x62, RW, 32, 0x2449_2929),
+    Register(0x63, RW, 32, 0x1010_4222),
+    Register(0x64, RW, 32, 0xfbff_ffff),
+    Register(0x65, RW, 32, 0xb5bb_777d),
+    Register(0x66, RW, 32, 0x4929_5556),
+    Register(0x67, RW, 32, 0x0040_4222),
+    Register(MSLUTSEL, RW, 32, 0xffff_8056),
+    Register(MSLUTSTART, RW, 32, 0x00f7_0000),
+    Register(MSCNT, R, 10, 0),    // computed
+    Register(MSCURACT, R, 25, 0), // computed
+    Register(CHOPCONF, RW, 32, 0x1041_0150),
+    Register(COOLCONF, RW, 25, 0),
+    Register(DRV_STATUS, R, 32, 0), // computed
+    Register(PWMCONF, RW, 32, 0xc44c_001e),
+    Register(0x71, R, 25, 0),     // PWM_SCALE
+    Register(PWM_AUTO, R, 24, 0), // computed
+    Register(0x74, RW, 10, 0),    // SG4_THRS
+    Register(0x75, R, 10, 0),     // SG4_RESULT
+    Register(0x76, R, 32, 0),     // SG4_IND
+];
+
+/// ADC_VSUPPLY: 9.732 mV for each count.
+const ADC_24_V: u32 = 2466;
+/// ADC_TEMP: (count - 2038) / 7.7 degrees Celsius.
+const ADC_35_C: u32 = 2308;
+
+/// A driver TMC5160.
+pub type Tmc5160Config = SpiDriverConfig<5160>;
+/// A driver TMC2130.
+pub type Tmc2130Config = SpiDriverConfig<2130>;
+/// A driver TMC2240.
+pub type Tmc2240Config = SpiDriverConfig<2240>;
+
 /// The chip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Tmc5160Config {
+pub struct SpiDriverConfig<const MODEL: u16> {
     /// Its SPI bus.
     pub bus: String,
     /// Low selects the chip. Without this pin it is the only chip on its bus.
@@ -156,11 +253,20 @@ pub struct Tmc5160Config {
     pub axis: String,
     /// DIAG1, an open drain with a pull-up resistor: low while the motor is stalled.
     pub diag1_pin: Option<PinName>,
+    /// DIAG0, an open drain too, with the same meaning if the host asks for it.
+    pub diag0_pin: Option<PinName>,
+    /// SG_RESULT of a free motor with SGT at 0. Each step of SGT adds 10. A motor with full load has 300 less.
+    #[serde(default = "default_sg_free")]
+    pub sg_free: i32,
 }
 
-impl Part for Tmc5160Config {
+fn default_sg_free() -> i32 {
+    SG_FREE
+}
+
+impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
     fn name(&self) -> String {
-        format!("tmc5160 {}", self.axis)
+        format!("tmc{MODEL} {}", self.axis)
     }
 
     fn socket(&self) -> Option<Socket<'_>> {
@@ -168,41 +274,54 @@ impl Part for Tmc5160Config {
     }
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
-        vec![("diag1_pin", self.diag1_pin.as_ref())]
+        vec![("diag1_pin", self.diag1_pin.as_ref()), ("diag0_pin", self.diag0_pin.as_ref())]
     }
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
+        if !(-1000..=1000).contains(&self.sg_free) {
+            return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give -1000 to 1000");
+        }
         printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(axis) = workshop.axis(&self.axis) {
-            let chip = Tmc5160::new(self.name(), axis, workshop.clock.clone());
-            workshop.wire_shared(self.diag1_pin.as_ref(), chip.diag1.clone());
+            let chip = Tmc5160::new(self.name(), (MODEL, self.sg_free), axis, workshop.clock.clone());
+            let [diag0, diag1] = chip.diag.clone();
+            workshop.wire_shared(self.diag0_pin.as_ref(), diag0);
+            workshop.wire_shared(self.diag1_pin.as_ref(), diag1);
             workshop.solder_spi(self, chip);
         }
         Ok(())
     }
 
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
-        cfg.section(format_args!("tmc5160 {}", layout.stepper(&self.axis)));
+        cfg.section(format_args!("tmc{MODEL} {}", layout.stepper(&self.axis)));
         may_be_left_out(cfg);
         cfg.spi(&self.bus, self.select_pin.as_ref());
         cfg.key("run_current", 0.8);
-        cfg.key("sense_resistor", 0.075);
+        match MODEL {
+            2240 => cfg.key("rref", 12000),
+            2130 => cfg.key("sense_resistor", 0.11),
+            _ => cfg.key("sense_resistor", 0.075),
+        }
         if let Some(pin) = &self.diag1_pin {
             // An open drain: a low level reports a stall.
             let inverted = if pin.inverted { "" } else { "!" };
             cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
-            offer_sensorless_homing(cfg, layout, "tmc5160", &self.axis, ("driver_SGT", 0));
+            offer_sensorless_homing(cfg, layout, &format!("tmc{MODEL}"), &self.axis, ("driver_SGT", 0));
         }
     }
 }
 
 struct Tmc5160 {
+    model: u16,
+    /// SG_RESULT of the free motor with SGT at 0.
+    sg_free: i32,
     motor: Motor,
     time: Arc<dyn TimeSource>,
-    diag1: Arc<StallOutput>,
+    /// DIAG0 and DIAG1.
+    diag: [Arc<StallOutput>; 2],
     registers: Registers,
     /// The shift register of 40 bits; the next field counts the bytes since the chip was selected.
     shift: u64,
@@ -213,11 +332,16 @@ struct Tmc5160 {
 
 impl Tmc5160 {
     /// The driver of an axis, at power-up.
-    fn new(name: String, axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
-        let registers = Registers::new(REGISTERS);
-        let rule = stall_rule(&registers);
-        let diag1 = Arc::new(StallOutput::new(name, axis.clone(), rule));
-        let mut chip = Tmc5160 { motor: Motor::new(axis), time, diag1, registers, shift: 0, bytes: 0, reply: 0 };
+    fn new(name: String, (model, sg_free): (u16, i32), axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
+        let registers = Registers::new(match model {
+            2130 => REGISTERS_2130,
+            2240 => REGISTERS_2240,
+            _ => REGISTERS,
+        });
+        let diag = [0, 1]
+            .map(|pin| Arc::new(StallOutput::new(name.clone(), axis.clone(), stall_rule(&registers, sg_free, pin))));
+        let motor = Motor::new(axis);
+        let mut chip = Tmc5160 { model, sg_free, motor, time, diag, registers, shift: 0, bytes: 0, reply: 0 };
         chip.set_up_motor();
         chip
     }
@@ -235,7 +359,12 @@ impl Tmc5160 {
                 let inputs = [self.motor.axis.is_stepped(), self.motor.axis.is_dir_high()].map(u32::from);
                 // DRV_ENN switches the power stage off.
                 let off = u32::from(!self.motor.axis.is_enabled());
-                VERSION | SD_MODE | off << 4 | inputs[1] << 1 | inputs[0]
+                let version = match self.model {
+                    2130 => VERSION_2130,
+                    2240 => VERSION_2240,
+                    _ => VERSION,
+                };
+                version | SD_MODE | off << 4 | inputs[1] << 1 | inputs[0]
             }
             TSTEP => self.motor.tstep(now),
             MSCNT => self.motor.mscnt(),
@@ -246,7 +375,9 @@ impl Tmc5160 {
             }
             DRV_STATUS => self.drv_status(now),
             // PWM_GRAD and PWM_OFS, from which the tuning starts.
-            PWM_AUTO => (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff,
+            PWM_AUTO if self.model != 2130 => {
+                (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff
+            }
             _ => self.registers.read(address),
         }
     }
@@ -257,7 +388,9 @@ impl Tmc5160 {
             self.set_up_motor();
             self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
         }
-        self.diag1.set(stall_rule(&self.registers));
+        for (pin, diag) in self.diag.iter().enumerate() {
+            diag.set(stall_rule(&self.registers, self.sg_free, pin));
+        }
     }
 
     fn drv_status(&self, now: Clock) -> u32 {
@@ -269,7 +402,7 @@ impl Tmc5160 {
         // Only SpreadCycle measures the load.
         if !stealth && !stands {
             let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
-            let result = (SG_FREE + SG_PER_SGT * sgt(&self.registers) - fall).clamp(0, 0x3ff) as u32;
+            let result = (self.sg_free + SG_PER_SGT * sgt(&self.registers) - fall).clamp(0, 0x3ff) as u32;
             status |= result | if result == 0 { DRV_STATUS_STALLGUARD } else { 0 };
         }
         status
@@ -291,19 +424,19 @@ fn sgt(registers: &Registers) -> i32 {
     if bits < 0x40 { bits } else { bits - 0x80 }
 }
 
-/// When DIAG1 reports a stall: SG_RESULT is 0, the velocity is at least TCOOLTHRS, and SpreadCycle is in use.
-fn stall_rule(registers: &Registers) -> StallRule {
+/// When DIAG0 or DIAG1 reports a stall: SG_RESULT is 0, the velocity is at least TCOOLTHRS, and SpreadCycle is in use.
+fn stall_rule(registers: &Registers, sg_free: i32, pin: usize) -> StallRule {
     let is_set = |bit| registers.is_set(GCONF, bit);
     // The lowest load at which SG_RESULT is 0.
-    let load = (SG_FREE + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
+    let load = (sg_free + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
     let load = (load.max(0) as u32).div_ceil(SG_FALL as u32);
     let stealth_from = if is_set(GCONF_EN_PWM_MODE) { registers.get(TPWMTHRS) } else { STANDSTILL };
     StallRule {
-        least_load: (is_set(GCONF_DIAG1_STALL) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
+        least_load: (is_set(GCONF_DIAG_STALL[pin]) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
         fastest: 0,
         slowest: registers.get(TCOOLTHRS).min(stealth_from.saturating_sub(1)),
         mres: (registers.get(CHOPCONF) >> 24 & 0xf).min(8),
-        push_pull: is_set(GCONF_DIAG1_PUSHPULL),
+        push_pull: is_set(GCONF_DIAG_PUSHPULL[pin]),
     }
 }
 
@@ -333,7 +466,12 @@ impl SpiChip for Tmc5160 {
         let [.., address, d3, d2, d1, d0] = self.shift.to_be_bytes();
         let data = u32::from_be_bytes([d3, d2, d1, d0]);
         self.reply = if address & WRITE == 0 {
-            self.read(address)
+            let value = self.read(address);
+            // Reading clears the flags of a TMC2130. The others want a one to be written.
+            if self.model == 2130 && address == GSTAT {
+                self.registers.write(GSTAT, value);
+            }
+            value
         } else {
             self.write(address & !WRITE, data);
             data
@@ -355,9 +493,13 @@ mod tests {
 
     impl Bench {
         fn new() -> Bench {
+            Bench::of(5160)
+        }
+
+        fn of(model: u16) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
-            let chip = Tmc5160::new("z".into(), axis.clone(), Arc::new(clock.clone()));
+            let chip = Tmc5160::new("z".into(), (model, SG_FREE), axis.clone(), Arc::new(clock.clone()));
             Bench { axis, clock, chip }
         }
 
@@ -406,6 +548,27 @@ mod tests {
         assert_eq!(bench.datagram(GCONF | WRITE, 0x1234_5678).1, 0x1041_0150);
         assert_eq!(bench.datagram(GCONF, 0).1, 0x1234_5678, "what was written, though it has 18 bits");
         assert_eq!(bench.datagram(GCONF, 0).1, 0x0000_5678);
+    }
+
+    #[test]
+    fn each_model_has_its_version_and_its_registers() {
+        for (model, version, chopconf, temperature) in
+            [(5160, 0x30, 0x1041_0150, 0), (2130, 0x11, 0, 0), (2240, 0x40, 0x1041_0150, ADC_35_C)]
+        {
+            let mut bench = Bench::of(model);
+            assert_eq!(bench.read(IOIN) >> 24, version, "{model}");
+            assert_eq!(bench.read(CHOPCONF), chopconf, "{model}");
+            assert_eq!(bench.read(0x51), temperature, "{model}");
+        }
+    }
+
+    #[test]
+    fn reading_clears_the_flags_of_a_tmc2130_only() {
+        for (model, again) in [(2130, 0), (5160, 1), (2240, 1)] {
+            let mut bench = Bench::of(model);
+            assert_eq!(bench.read(GSTAT), 1, "{model}");
+            assert_eq!(bench.read(GSTAT), again, "{model}");
+        }
     }
 
     #[test]
@@ -489,19 +652,19 @@ mod tests {
         bench.write(COOLCONF, 0x7c << 16);
         assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 10, "SGT of -4");
         bench.write(COOLCONF, 0);
-        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_DIAG1_PUSHPULL);
+        bench.write(GCONF, GCONF_DIAG_STALL[1] | GCONF_DIAG_PUSHPULL[1]);
         bench.write(TCOOLTHRS, STANDSTILL);
-        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        assert!(!bench.chip.diag[1].is_stalled(bench.clock.now()));
         bench.steps(3, 1);
         assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, DRV_STATUS_STALLGUARD);
         assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 4);
-        assert!(bench.chip.diag1.is_stalled(bench.clock.now()));
+        assert!(bench.chip.diag[1].is_stalled(bench.clock.now()));
         // StealthChop has no StallGuard.
-        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_EN_PWM_MODE);
+        bench.write(GCONF, GCONF_DIAG_STALL[1] | GCONF_EN_PWM_MODE);
         assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, 0);
-        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        assert!(!bench.chip.diag[1].is_stalled(bench.clock.now()));
         bench.advance_ms(90);
-        bench.write(GCONF, GCONF_DIAG1_STALL);
-        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()), "it stands still");
+        bench.write(GCONF, GCONF_DIAG_STALL[1]);
+        assert!(!bench.chip.diag[1].is_stalled(bench.clock.now()), "it stands still");
     }
 }

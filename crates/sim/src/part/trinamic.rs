@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::description::axes::End;
-use crate::engine::physics::Axis;
+use crate::engine::motion::Axis;
 use crate::engine::wire::{Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;

@@ -88,9 +88,9 @@ pub(crate) trait UartChip: Send {
     fn send_delay(&self) -> u64;
 }
 
-/// The chip's UART on its wire. The wire is high when nothing drives it low.
+/// The UART of the chips on a wire. They hear the same. The wire is high when nothing drives it low.
 pub(crate) struct Uart {
-    chip: Box<dyn UartChip>,
+    chips: Vec<Box<dyn UartChip>>,
     expects: Expects,
     /// The wire's level as the MCU drives it; the next field is since when.
     high: bool,
@@ -128,7 +128,7 @@ impl Answer {
 impl Uart {
     pub(crate) fn new(chip: Box<dyn UartChip>) -> Uart {
         Uart {
-            chip,
+            chips: vec![chip],
             expects: Expects::Message,
             high: true,
             since: Clock::EPOCH,
@@ -138,6 +138,11 @@ impl Uart {
             len: 0,
             answer: None,
         }
+    }
+
+    /// Puts another chip on the wire.
+    pub(crate) fn solder(&mut self, chip: Box<dyn UartChip>) {
+        self.chips.push(chip);
     }
 
     /// The MCU drives the wire, or releases it. A released wire is pulled up.
@@ -220,9 +225,13 @@ impl Uart {
             return;
         }
         self.expects = Expects::Message;
-        let bytes = self.chip.hear(message, now);
-        let end = self.start.ticks() + (FRAME_BITS + self.chip.send_delay()) * self.bit;
-        self.answer = bytes.map(|bytes| Answer { at: Clock::from_ticks(end), bit: self.bit, bytes });
+        let answers = self.chips.iter_mut().filter_map(|chip| Some((chip.hear(message, now)?, chip.send_delay())));
+        // Two chips with one address answer the same.
+        let answer = answers.fold(None, |first, answer| first.or(Some(answer)));
+        self.answer = answer.map(|(bytes, delay)| {
+            let end = self.start.ticks() + (FRAME_BITS + delay) * self.bit;
+            Answer { at: Clock::from_ticks(end), bit: self.bit, bytes }
+        });
     }
 
     /// The level of the wire when the MCU does not drive it.

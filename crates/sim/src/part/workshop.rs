@@ -3,16 +3,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
-use crate::description::axes::DeltaConfig;
+use super::uart::Uart;
 use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::{Kinematics, Printer};
-use crate::engine::bed::{Bed, Delta, Head, Plane};
+use crate::engine::bed::{Bed, BedShape, Hanging, Head, Plane};
 use crate::engine::i2c::{I2cBus, I2cChip};
+use crate::engine::motion::{Axis, Rail};
 use crate::engine::noise::Noise;
-use crate::engine::physics::{Axis, Heater};
+use crate::engine::physics::Heater;
 use crate::engine::serial::{SerialChip, SerialWire};
 use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use crate::engine::wire::{ControllerPin, Kind, Wire, WiredPin};
@@ -44,6 +45,11 @@ pub(crate) trait Part {
         None
     }
 
+    /// The pins of UARTs by their keys. Several chips with a UART may share them.
+    fn uart_pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        Vec::new()
+    }
+
     /// The pins of its wires by their keys, without the pin that selects it on its bus.
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
         Vec::new()
@@ -73,6 +79,8 @@ pub(crate) struct Workshop<'a> {
     pub(crate) spi_buses: Vec<SpiBus>,
     pub(crate) i2c_buses: Vec<I2cBus>,
     pub(crate) serial_wires: Vec<SerialWire>,
+    /// The wires of UARTs on lines, by the name of the line.
+    pub(crate) uarts: Vec<(String, Arc<Mutex<Uart>>)>,
 }
 
 impl Workshop<'_> {
@@ -91,25 +99,51 @@ impl Workshop<'_> {
         Noise::of(&part.name(), self.printer.seed)
     }
 
-    /// The bed under the nozzle.
-    pub(crate) fn bed(&self) -> Bed {
-        Bed::new(self.printer.bed.clone(), self.delta().map_or_else(|| self.gantry(), Head::Delta))
+    /// A rail by its name: a carriage, or the rail of an axis.
+    pub(crate) fn rail(&self, name: &str) -> Option<Arc<Rail>> {
+        let carriage = self.world.carriages.iter().find(|rail| rail.name == name).cloned();
+        carriage.or_else(|| self.axis(name).map(|axis| axis.rail().clone()))
     }
 
-    /// The three arms of a delta printer.
-    fn delta(&self) -> Option<Delta> {
-        let Kinematics::Delta(delta) = self.printer.kinematics() else { return None };
-        let [a, b, c] = DeltaConfig::TOWERS.map(|tower| self.axis(tower));
-        Some(Delta::new(delta, [a?, b?, c?]))
+    /// The bed under the nozzle.
+    pub(crate) fn bed(&self) -> Bed {
+        Bed::new(self.printer.bed.clone(), self.hanging().map_or_else(|| self.gantry(), Head::Hanging))
+    }
+
+    /// The head of a printer without a gantry.
+    fn hanging(&self) -> Option<Hanging> {
+        let disc = |radius_mm| BedShape::Disc { radius_mm };
+        let kinematics = self.printer.kinematics();
+        let rails: Vec<Arc<Rail>> = kinematics.rails().iter().filter_map(|name| self.rail(name)).collect();
+        let end_mm = |rail: usize| rails.get(rail).and_then(|rail| rail.travel_mm).unwrap_or_default();
+        let bed = match kinematics {
+            Kinematics::Delta(delta) => disc(delta.bed_radius_mm),
+            Kinematics::RotaryDelta(rotary) => disc(rotary.bed_radius_mm),
+            Kinematics::Polar => disc(end_mm(1).1),
+            Kinematics::Winch(winch) => disc(winch.bed_radius_mm),
+            Kinematics::Deltesian(deltesian) => {
+                let (front_mm, back_mm) = end_mm(2);
+                let [left_mm, right_mm] = deltesian.arm_x_mm;
+                BedShape::Rectangle { min_mm: [-left_mm, front_mm], max_mm: [right_mm, back_mm] }
+            }
+            _ => return None,
+        };
+        let linkage = kinematics.linkage()?;
+        Some(Hanging::new(linkage, rails, bed))
     }
 
     /// The head of any other printer.
     fn gantry(&self) -> Head {
-        let motors = self.printer.motors("z").filter_map(|motor| {
-            let at_mm = motor.at_mm.unwrap_or_default();
-            self.axis(&motor.name).map(|axis| (axis, at_mm))
-        });
-        Head::Cartesian { x: self.axis("x"), y: self.axis("y"), z: Plane::new(motors.collect()) }
+        let placed = self.printer.axes.iter().filter(|motor| motor.at_mm.is_some());
+        let placed = placed.filter_map(|motor| Some((self.axis(&motor.name)?.rail().clone(), motor.at_mm?)));
+        let mut z: Vec<_> = placed.collect();
+        if z.is_empty() {
+            let motors = self.printer.motors("z").map(|motor| motor.name.as_str());
+            let names =
+                motors.chain(self.world.carriages.iter().map(|rail| rail.name.as_str()).filter(|name| *name == "z"));
+            z.extend(names.filter_map(|name| self.rail(name)).map(|rail| (rail, [0.0; 2])));
+        }
+        Head::Cartesian { x: self.rail("x"), y: self.rail("y"), z: Plane::new(z) }
     }
 
     /// Wires a pin, if the part has it.

@@ -13,7 +13,7 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, check_lights, wrong};
@@ -36,7 +36,7 @@ const ONE_LOW_NS: f64 = 450.0 - TOLERANCE_NS;
 const RESET_NS: f64 = 50_000.0;
 
 /// A strip's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ws2812Config {
     /// For example `strip`.

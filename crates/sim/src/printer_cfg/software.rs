@@ -48,7 +48,7 @@ impl Sections {
             }
             cfg.section("sdcard_loop");
             cfg.needs("virtual_sdcard");
-            if layout.kinematics.has_gantry() {
+            if layout.has_rails() {
                 cfg.screws(layout);
             }
         });

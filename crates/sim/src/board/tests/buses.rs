@@ -48,6 +48,8 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
     let driver = |axis: &str| {
         PartConfig::Tmc5160(Tmc5160Config {
             diag1_pin: None,
+            diag0_pin: None,
+            sg_free: 200,
             bus: "spidev1.0".into(),
             select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
             axis: axis.into(),
@@ -141,6 +143,7 @@ fn drivers_share_the_wire_of_a_serial_port() {
             address,
             axis: axis.into(),
             diag_pin: None,
+            sg_free: 250,
         })
     };
     config.parts = vec![driver("x", 0), driver("y", 3)];

@@ -28,7 +28,7 @@ impl Bench {
         axes.iter().for_each(|axis| axis.set_enabled(true));
         let [x, y, z] = [0, 1, 2].map(|i| Some(axes[i].clone()));
         let bed = Arc::new(Bed::under(Default::default(), x, y, z));
-        let recorder = Recorder::new(bed, &axes[3..], clock(1.0));
+        let recorder = Recorder::new(bed, &axes[3..], Ticks(0), clock(1.0));
         Bench { axes, recorder, at_s: 1.0, places: Vec::new() }
     }
 

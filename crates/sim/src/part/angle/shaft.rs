@@ -6,7 +6,7 @@
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-use crate::engine::physics::Axis;
+use crate::engine::motion::Axis;
 
 /// The shaft that a sensor measures.
 pub(super) struct Shaft {

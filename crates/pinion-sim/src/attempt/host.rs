@@ -1,0 +1,258 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A klippy that this program starts, and its API server.
+
+#![forbid(unsafe_code)]
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use crate::own::serve::Folder;
+use pinion_printer_config::Trouble;
+
+/// The end of a message.
+const END: u8 = 3;
+/// Longest message.
+const MESSAGE_MAX: usize = 64 << 20;
+/// How long klippy has to open its API.
+const START: Duration = Duration::from_secs(60);
+/// How long klippy has to answer a question about its state.
+const ANSWER: Duration = Duration::from_secs(30);
+/// Time between two reads of klippy's state while a command runs.
+const LOOK: Duration = Duration::from_secs(5);
+/// How long klippy has to end in order.
+const END_TIME: Duration = Duration::from_secs(3);
+
+/// What became of a command.
+#[derive(Debug)]
+pub(super) enum Refused {
+    /// klippy refused it, in its words.
+    Error(String),
+    /// It took too long.
+    Late,
+    /// klippy is gone.
+    Gone(String),
+}
+
+/// A klippy.
+pub(super) struct Host {
+    child: Child,
+    socket: PathBuf,
+    api: UnixStream,
+    buffer: Vec<u8>,
+    next_id: u64,
+    /// Answers to other questions than the one that is waited for.
+    answers: HashMap<u64, Value>,
+    /// What klippy said since the last command.
+    pub(super) said: Vec<String>,
+}
+
+impl Host {
+    /// Starts a klippy on the copy in a folder.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be started, or opens no API.
+    pub(super) fn start(klipper: &Path, python: &Path, folder: &Folder, realtime: bool) -> Result<Host, Trouble> {
+        let program = klipper.join("klippy/klippy.py");
+        let failed = |cause: String| Trouble::new(cause).of(program.display());
+        if !program.is_file() {
+            let trouble = failed("there is no klippy".into());
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR"));
+        }
+        let socket = folder.path.join("klippy.sock");
+        let _ = std::fs::remove_file(&socket);
+        let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
+        // While it homes, klippy is a tenth of a second ahead of the MCU, and a busy computer makes it late.
+        let mut command = Command::new(if realtime { Path::new("chrt") } else { python });
+        if realtime {
+            command.args(["-f", "1"]).arg(python);
+        }
+        command.arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
+        command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
+        command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
+        // A Ctrl-C ends this program, which ends klippy.
+        let started = command.stderr(output).process_group(0).spawn();
+        let mut child = started.map_err(|error| {
+            failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
+        })?;
+        let until = Instant::now() + START;
+        let api = loop {
+            if let Ok(api) = UnixStream::connect(&socket) {
+                break api;
+            }
+            let ended = child.try_wait().ok().flatten();
+            if ended.is_some() || Instant::now() > until {
+                let _ = child.kill();
+                let _ = child.wait();
+                let log = folder.path.join("klippy.out");
+                let said = std::fs::read_to_string(&log).unwrap_or_default();
+                let last = said.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or_default().to_owned();
+                let trouble = failed(format!("klippy does not start: {last}"));
+                return Err(trouble.remedy(format!("read {}, and name its Python with --python", log.display())));
+            }
+            thread::sleep(Duration::from_millis(50));
+        };
+        let mut host =
+            Host { child, socket, api, buffer: Vec::new(), next_id: 0, answers: HashMap::new(), said: Vec::new() };
+        let subscribed = host.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER);
+        subscribed.map(|_| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
+    }
+
+    /// A call of the API.
+    pub(super) fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
+        let id = self.send(method, params)?;
+        self.answer(id, Instant::now() + limit)
+    }
+
+    /// Sends a question, and returns its number.
+    fn send(&mut self, method: &str, params: Value) -> Result<u64, Refused> {
+        self.next_id += 1;
+        let mut request = json!({ "id": self.next_id, "method": method, "params": params }).to_string().into_bytes();
+        request.push(END);
+        self.api.write_all(&request).map_err(|error| Refused::Gone(error.to_string()))?;
+        Ok(self.next_id)
+    }
+
+    /// Waits for the answer to a question.
+    fn answer(&mut self, id: u64, until: Instant) -> Result<Value, Refused> {
+        loop {
+            let message = match self.answers.remove(&id) {
+                Some(message) => message,
+                None => self.message(until)?,
+            };
+            if let Some(line) = message["params"]["response"].as_str() {
+                self.said.push(line.to_owned());
+            }
+            match message["id"].as_u64() {
+                Some(other) if other == id => {
+                    return match &message["error"] {
+                        Value::Null => Ok(message["result"].clone()),
+                        error => {
+                            let words = error["message"].as_str().map_or_else(|| error.to_string(), str::to_owned);
+                            Err(Refused::Error(words))
+                        }
+                    };
+                }
+                Some(other) => _ = self.answers.insert(other, message),
+                None => {}
+            }
+        }
+    }
+
+    fn message(&mut self, until: Instant) -> Result<Value, Refused> {
+        let mut piece = [0; 4096];
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == END) {
+                let message = serde_json::from_slice(&self.buffer[..end]).unwrap_or_default();
+                self.buffer.drain(..=end);
+                return Ok(message);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(Refused::Late);
+            }
+            let gone = |cause: &str| Refused::Gone(cause.to_owned());
+            self.api.set_read_timeout(Some(left)).map_err(|error| gone(&error.to_string()))?;
+            match self.api.read(&mut piece) {
+                Ok(0) => return Err(gone("klippy ended")),
+                Ok(read) => self.buffer.extend_from_slice(&piece[..read]),
+                Err(error) if matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => {
+                }
+                Err(error) => return Err(gone(&error.to_string())),
+            }
+            if self.buffer.len() > MESSAGE_MAX {
+                return Err(gone("its message has no end"));
+            }
+        }
+    }
+
+    /// Runs G-code to its end. A klippy that stopped may never answer, so its state is read now and then.
+    pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
+        self.said.clear();
+        let id = self.send("gcode/script", json!({ "script": script }))?;
+        let until = Instant::now() + limit;
+        let mut stopped = None;
+        loop {
+            match self.answer(id, until.min(Instant::now() + LOOK)) {
+                Err(Refused::Late) if stopped.is_some() => return Err(Refused::Error(stopped.unwrap_or_default())),
+                Err(Refused::Late) if Instant::now() < until => {
+                    let (state, words) = self.state()?;
+                    stopped = (state != "ready").then_some(words);
+                }
+                answer => return answer.map(drop),
+            }
+        }
+    }
+
+    /// Restarts klippy and its MCUs. Its API is another one then.
+    pub(super) fn restart(&mut self) -> Result<(), Refused> {
+        self.send("gcode/firmware_restart", json!({}))?;
+        let until = Instant::now() + START;
+        let gone = |error: std::io::Error| Refused::Gone(error.to_string());
+        // klippy ends all connections when it restarts.
+        while !matches!(self.message(until), Err(Refused::Gone(_) | Refused::Late)) {}
+        self.api = loop {
+            match UnixStream::connect(&self.socket) {
+                Ok(api) => break api,
+                Err(error) if Instant::now() > until => return Err(gone(error)),
+                Err(_) => thread::sleep(Duration::from_millis(50)),
+            }
+        };
+        self.buffer.clear();
+        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
+    }
+
+    /// klippy's state and its words about it.
+    pub(super) fn state(&mut self) -> Result<(String, String), Refused> {
+        let info = self.call("info", json!({}), ANSWER)?;
+        let text = |key: &str| info[key].as_str().unwrap_or_default().to_owned();
+        Ok((text("state"), text("state_message")))
+    }
+
+    /// The status of objects.
+    pub(super) fn query(&mut self, objects: &[&str]) -> Result<Value, Refused> {
+        let objects: serde_json::Map<String, Value> =
+            objects.iter().map(|name| ((*name).to_owned(), Value::Null)).collect();
+        let answer = self.call("objects/query", json!({ "objects": objects }), ANSWER)?;
+        Ok(answer["status"].clone())
+    }
+
+    /// All objects of klippy.
+    pub(super) fn objects(&mut self) -> Result<Vec<String>, Refused> {
+        let answer = self.call("objects/list", json!({}), ANSWER)?;
+        let names = answer["objects"].as_array().cloned().unwrap_or_default();
+        Ok(names.iter().filter_map(Value::as_str).map(str::to_owned).collect())
+    }
+
+    /// Another connection, which stops the printer while a command runs.
+    pub(super) fn stop(&self) {
+        if let Ok(mut api) = UnixStream::connect(&self.socket) {
+            let _ = api.write_all(b"{\"id\":1,\"method\":\"emergency_stop\"}\x03");
+        }
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        let pid = nix::unistd::Pid::from_raw(self.child.id().cast_signed());
+        let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM);
+        let until = Instant::now() + END_TIME;
+        while Instant::now() < until {
+            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
+                return;
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,691 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim PRINTER.CFG --try`: a klippy on the user's configuration does what every owner does after a change.
+//!
+//! Each step is one command or a few, and looks at the printer, not only at klippy: where the motors put the nozzle, how
+//! hot the heater is, how fast the fan turns.
+
+#![forbid(unsafe_code)]
+
+mod host;
+mod place;
+mod report;
+mod small;
+
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use pinion::cli::files;
+use pinion_firmware::time::{Clock, Ticks};
+use pinion_printer_config::{Limit, Place, Trouble};
+use pinion_sim::{AskedPath, SimProbe, compare};
+use serde_json::Value;
+
+use crate::own::serve::{Folder, Own};
+use host::{Host, Refused};
+use place::place_of;
+use report::{Form, Outcome, Report};
+
+/// How long klippy has to be ready.
+const READY: Duration = Duration::from_secs(90);
+/// How long homing, leveling or a macro may take.
+const LONG: Duration = Duration::from_secs(400);
+/// How long a print may take.
+const PRINT: Duration = Duration::from_secs(4 * 3600);
+/// How long a heater may take.
+const HEAT: Duration = Duration::from_secs(240);
+/// How long it may take until a fan turns or a heater cools.
+const SOON: Duration = Duration::from_secs(30);
+/// How near a temperature has to be.
+const NEAR_K: f64 = 4.0;
+/// How near the nozzle has to be to klippy's position.
+const NEAR_MM: f64 = 0.15;
+/// Distance above which a print is wrong.
+const WITHIN_MM: f64 = 0.1;
+/// Longest G-code file.
+const GCODE_MIB: u64 = 256;
+/// Names of macros that begin and end a print.
+const STARTS: [&str; 4] = ["START_PRINT", "PRINT_START", "START_GCODE", "BEGIN_PRINT"];
+const ENDS: [&str; 3] = ["END_PRINT", "PRINT_END", "END_GCODE"];
+
+/// Words of a stop because a computer is too busy.
+const BUSY: [&str; 5] = [
+    "Timer too close",
+    "Rescheduled timer in the past",
+    "Missed scheduling of next",
+    "Lost communication with MCU",
+    "Communication timeout during homing",
+];
+/// How often a step is repeated because of them.
+const TRIES: u32 = 4;
+
+/// What is tried, and how.
+#[derive(Clone, Debug)]
+pub(crate) struct Attempt {
+    pub(crate) klipper: PathBuf,
+    pub(crate) python: PathBuf,
+    /// A file to print in place of the small one.
+    pub(crate) gcode: Option<PathBuf>,
+    /// Only these steps, if there are any.
+    pub(crate) only: Vec<String>,
+    pub(crate) json: bool,
+    /// klippy gets real time, too.
+    pub(crate) realtime: bool,
+}
+
+/// Tries a printer. Returns whether nothing failed. `ended` is set when the program is asked to end.
+pub(crate) fn run(
+    attempt: &Attempt,
+    (own, printer): (&Own, &Path),
+    folder: &Folder,
+    probe: &SimProbe,
+    ended: &AtomicBool,
+) -> bool {
+    let form = if attempt.json { Form::Json } else { Form::Lines };
+    let mut report = Report::new(form);
+    let since = Instant::now();
+    report.progress("klippy starts");
+    let host = match Host::start(&attempt.klipper, &attempt.python, folder, attempt.realtime) {
+        Ok(host) => host,
+        Err(trouble) => {
+            report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, since);
+            report.end(printer, &folder.path);
+            return false;
+        }
+    };
+    let mut trial = Trial { attempt, own, probe, host, objects: Vec::new(), broken: None };
+    for step in STEPS {
+        if ended.load(Ordering::SeqCst) {
+            break;
+        }
+        if !attempt.only.is_empty() && step.name != "ready" && !attempt.only.iter().any(|only| only == step.name) {
+            continue;
+        }
+        let since = if step.name == "ready" { since } else { Instant::now() };
+        report.progress(step.name);
+        let outcome = match &trial.broken {
+            Some(why) => Outcome::Skipped(format!("not tried: {why}")),
+            None => trial.tried(step),
+        };
+        if matches!(outcome, Outcome::Failed { .. }) {
+            trial.recover(step.name);
+        }
+        report.add(step.name, outcome, since);
+    }
+    drop(trial);
+    report.end(printer, &folder.path);
+    report.passed() && !ended.load(Ordering::SeqCst)
+}
+
+/// Something that is tried.
+struct Step {
+    name: &'static str,
+    run: fn(&mut Trial<'_>) -> Outcome,
+}
+
+const STEPS: &[Step] = &[
+    Step { name: "ready", run: |trial| trial.ready() },
+    Step { name: "homed", run: |trial| trial.homed() },
+    Step { name: "heated", run: |trial| trial.heated() },
+    Step { name: "fans", run: |trial| trial.fans() },
+    Step { name: "lights", run: |trial| trial.lights() },
+    Step { name: "servo", run: |trial| trial.servo() },
+    Step { name: "z_tilt", run: |trial| trial.leveled("z_tilt", "Z_TILT_ADJUST") },
+    Step { name: "gantry", run: |trial| trial.leveled("quad_gantry_level", "QUAD_GANTRY_LEVEL") },
+    Step { name: "bed_mesh", run: |trial| trial.leveled("bed_mesh", "BED_MESH_CALIBRATE") },
+    Step { name: "probe", run: |trial| trial.probed() },
+    Step { name: "shaper", run: |trial| trial.shaped() },
+    Step { name: "macros", run: |trial| trial.macros() },
+    Step { name: "printed", run: |trial| trial.printed() },
+    Step { name: "cooled", run: |trial| trial.cooled() },
+];
+
+struct Trial<'a> {
+    attempt: &'a Attempt,
+    own: &'a Own,
+    probe: &'a SimProbe,
+    host: Host,
+    objects: Vec<String>,
+    /// Why nothing more can be tried.
+    broken: Option<String>,
+}
+
+impl Trial<'_> {
+    fn failed(&self, cause: impl Into<String>, place: Option<Place>) -> Outcome {
+        let cause = cause.into();
+        let place = place.or_else(|| place_of(&self.own.config, &cause));
+        // klippy's words have several lines, of which the first ones say it.
+        let lines: Vec<&str> = cause.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+        let cause = lines.iter().take(2).copied().collect::<Vec<&str>>().join(" ");
+        Outcome::Failed { cause, place }
+    }
+
+    /// klippy's words about a refusal: those about its stop, if it stopped.
+    fn why(&mut self, words: String) -> String {
+        match self.host.state() {
+            Ok((state, about)) if state != "ready" => about,
+            _ => words,
+        }
+    }
+
+    /// Runs G-code. The error is the outcome.
+    fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
+        match self.host.gcode(script, limit) {
+            Ok(()) => Ok(()),
+            Err(Refused::Error(words)) => {
+                let words = self.why(words);
+                Err(self.failed(format!("{script}: {words}"), None))
+            }
+            Err(Refused::Late) => {
+                self.host.stop();
+                Err(self.failed(format!("{script}: it takes longer than {} s", limit.as_secs()), None))
+            }
+            Err(Refused::Gone(why)) => {
+                self.broken = Some("klippy ended".into());
+                Err(self.failed(format!("{script}: klippy is gone: {why}"), None))
+            }
+        }
+    }
+
+    /// Runs a step. It is repeated if the computer was too busy for it: that says nothing about the printer.
+    fn tried(&mut self, step: &Step) -> Outcome {
+        for _ in 0..TRIES {
+            let outcome = (step.run)(self);
+            let Outcome::Failed { cause, .. } = &outcome else { return outcome };
+            if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
+                return outcome;
+            }
+            if self.host.restart().is_err()
+                || self.until_ready().is_err()
+                || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err()
+            {
+                return outcome;
+            }
+        }
+        (step.run)(self)
+    }
+
+    /// After a failure: goes on if klippy is ready, or is so after a restart.
+    fn recover(&mut self, step: &str) {
+        if self.broken.is_some() {
+            return;
+        }
+        let state = self.host.state().map(|(state, _)| state).unwrap_or_default();
+        if state == "ready" {
+            if step == "homed" {
+                self.broken = Some("it is not homed".into());
+            }
+            return;
+        }
+        if step != "ready" && step != "homed" {
+            if self.host.restart().is_ok() && self.until_ready().is_ok() && self.host.gcode("G28", LONG).is_ok() {
+                return;
+            }
+        }
+        self.broken = Some("klippy is not ready".into());
+    }
+
+    /// Waits until klippy is ready. The error is its words.
+    fn until_ready(&mut self) -> Result<(), String> {
+        let until = Instant::now() + READY;
+        loop {
+            match self.host.state() {
+                Ok((state, _)) if state == "ready" => return Ok(()),
+                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
+                Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
+                Ok(_) => thread::sleep(Duration::from_millis(100)),
+                Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
+            }
+        }
+    }
+
+    fn ready(&mut self) -> Outcome {
+        if let Err(words) = self.until_ready() {
+            return self.failed(words, None);
+        }
+        match self.host.objects() {
+            Ok(objects) => self.objects = objects,
+            Err(refused) => return self.failed(format!("klippy names no objects: {refused:?}"), None),
+        }
+        let count = self.own.mcus.len();
+        Outcome::Passed(format!("klippy is ready, with {count} MCU{}", if count == 1 { "" } else { "s" }))
+    }
+
+    fn has(&self, object: &str) -> bool {
+        self.objects.iter().any(|name| name == object)
+    }
+
+    /// klippy's objects of a kind, by their own names.
+    fn named(&self, kind: &str) -> Vec<String> {
+        let names = self.objects.iter().filter_map(|name| name.strip_prefix(kind)?.strip_prefix(' '));
+        names.map(str::to_owned).collect()
+    }
+
+    fn lost(&self) -> Vec<(String, u64)> {
+        self.probe.axes().map(|axis| (axis.name.to_owned(), axis.lost_steps)).collect()
+    }
+
+    /// The axes that lost steps since then. An axis that homes by its driver's StallGuard has to.
+    fn new_lost(&self, before: &[(String, u64)]) -> Option<Outcome> {
+        let stalls = |name: &str| {
+            let sections = [format!("stepper_{name}"), name.to_owned()];
+            sections
+                .iter()
+                .filter_map(|name| self.own.config.section(name))
+                .any(|section| section.text("endstop_pin").is_some_and(|pin| pin.contains("virtual_endstop")))
+        };
+        let lost = self.lost().into_iter().zip(before).find(|((name, now), (_, then))| now > then && !stalls(name));
+        lost.map(|((name, now), (_, then))| {
+            let place = self.own.config.section(&format!("stepper_{name}")).map(|section| section.place.clone());
+            let count = now - then;
+            self.failed(format!("axis {name} lost {count} steps at an end of its travel"), place)
+        })
+    }
+
+    fn homed(&mut self) -> Outcome {
+        if self.own.config.section("printer").and_then(|printer| printer.text("kinematics")) == Some("none") {
+            return Outcome::Skipped("kinematics: none".into());
+        }
+        let before = self.lost();
+        if let Err(outcome) = self.gcode("G28", LONG) {
+            return outcome;
+        }
+        if let Err(outcome) = self.gcode("M400", LONG) {
+            return outcome;
+        }
+        if let Some(outcome) = self.new_lost(&before) {
+            return outcome;
+        }
+        let Ok(status) = self.host.query(&["toolhead"]) else { return self.failed("klippy does not answer", None) };
+        let toolhead = &status["toolhead"];
+        let homed = toolhead["homed_axes"].as_str().unwrap_or_default();
+        if !["x", "y", "z"].iter().all(|axis| homed.contains(axis)) {
+            return self.failed(format!("G28 homed only \"{homed}\""), None);
+        }
+        let position = coordinates(&toolhead["position"]);
+        let nozzle = self.probe.nozzle_mm();
+        // A probe that homes z finds the bed within its own distance of a step, and a mesh may be in force.
+        let off = position.iter().zip(nozzle).map(|(klippys, real)| (klippys - real).abs());
+        let off: Vec<f64> = off.collect();
+        let [x, y, z] = nozzle;
+        let far = off.iter().zip(["x", "y", "z"]).find(|(off, _)| **off > NEAR_MM + 0.5 * f64::from(**off > 1e9));
+        if let Some((off, axis)) = far.filter(|_| self.is_plain()) {
+            let place =
+                self.own.config.section(&format!("stepper_{axis}")).map(|s| s.place_of("position_endstop").clone());
+            return self.failed(format!("after G28 the nozzle is {off:.3} mm from klippy's {axis} position"), place);
+        }
+        Outcome::Passed(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
+    }
+
+    /// Whether klippy's position is the nozzle's: nothing is between them, and the bed does not change it.
+    fn is_plain(&self) -> bool {
+        let sections = ["bed_tilt", "skew_correction", "axis_twist_compensation", "z_tilt", "quad_gantry_level"];
+        let kinematics = self.own.config.section("printer").and_then(|printer| printer.text("kinematics"));
+        let simple = ["cartesian", "corexy", "corexz", "delta", "hybrid_corexy", "hybrid_corexz"];
+        !sections.iter().any(|name| self.own.config.section(name).is_some())
+            && kinematics.is_some_and(|kinematics| simple.contains(&kinematics))
+    }
+
+    /// The heaters with klippy's name and a usual temperature of theirs.
+    fn targets(&mut self) -> Vec<(String, f64)> {
+        let status = self.host.query(&["heaters"]).unwrap_or_default();
+        let names = status["heaters"]["available_heaters"].as_array().cloned().unwrap_or_default();
+        let names = names.iter().filter_map(Value::as_str).map(str::to_owned);
+        let target = |name: String| {
+            let section = self.own.config.section(&name)?;
+            let number = |key| section.number(key, Limit::Any).ok().flatten();
+            let max = number("max_temp")?;
+            let usual = if section.kind().starts_with("extruder") {
+                number("min_extrude_temp").unwrap_or(170.0).max(200.0)
+            } else if section.kind() == "heater_bed" {
+                60.0
+            } else {
+                50.0
+            };
+            Some((name, usual.min(max - 10.0)))
+        };
+        names.filter_map(target).collect()
+    }
+
+    fn heated(&mut self) -> Outcome {
+        let targets = self.targets();
+        if targets.is_empty() {
+            return Outcome::Skipped("there is no heater".into());
+        }
+        for (name, target) in &targets {
+            let own = name.rsplit(' ').next().unwrap_or(name);
+            if let Err(outcome) = self.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={own} TARGET={target}"), LONG) {
+                return outcome;
+            }
+        }
+        let until = Instant::now() + HEAT;
+        let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
+        loop {
+            let status = match self.host.query(&objects) {
+                Ok(status) => status,
+                Err(refused) => return self.failed(format!("klippy does not answer: {refused:?}"), None),
+            };
+            let celsius = |name: &str| status[name]["temperature"].as_f64().unwrap_or_default();
+            let cold = targets.iter().find(|(name, target)| (celsius(name) - target).abs() > NEAR_K);
+            let Some((name, target)) = cold else { break };
+            if let Ok((state, words)) = self.host.state()
+                && state != "ready"
+            {
+                return self.failed(words, None);
+            }
+            if Instant::now() > until {
+                let place = self.own.config.section(name).map(|section| section.place.clone());
+                return self.failed(format!("{name} is at {:.0} of {target} C", celsius(name)), place);
+            }
+            thread::sleep(Duration::from_millis(500));
+        }
+        // What klippy reads is what is there.
+        let status = self.host.query(&objects).unwrap_or_default();
+        for (name, _) in &targets {
+            let own = name.rsplit(' ').next().unwrap_or(name);
+            let read = status[name]["temperature"].as_f64().unwrap_or_default();
+            if let Some(heater) =
+                self.probe.heater(own).filter(|heater| (heater.sensor_celsius - read).abs() > 3.0 * NEAR_K)
+            {
+                let section = self.own.config.section(name);
+                let place = section.map(|section| section.place_of("sensor_type").clone());
+                return self.failed(format!("klippy reads {read:.0} C at {:.0} C", heater.sensor_celsius), place);
+            }
+        }
+        let seen: Vec<String> = targets.iter().map(|(name, target)| format!("{name} {target:.0} C")).collect();
+        Outcome::Passed(seen.join(", "))
+    }
+
+    fn cooled(&mut self) -> Outcome {
+        let targets = self.targets();
+        if targets.is_empty() {
+            return Outcome::Skipped("there is no heater".into());
+        }
+        let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
+        let read = |host: &mut Host| {
+            let status = host.query(&objects).unwrap_or_default();
+            let celsius = |name: &&str| status[*name]["temperature"].as_f64().unwrap_or_default();
+            objects.iter().map(celsius).collect::<Vec<f64>>()
+        };
+        let hot = read(&mut self.host);
+        if let Err(outcome) = self.gcode("TURN_OFF_HEATERS", LONG) {
+            return outcome;
+        }
+        let until = Instant::now() + SOON;
+        loop {
+            let now = read(&mut self.host);
+            let still = hot.iter().zip(&now).position(|(hot, now)| *hot > 45.0 && hot - now < 2.0);
+            match still {
+                None => return Outcome::Passed("all heaters are off, and cool".into()),
+                Some(n) if Instant::now() > until => {
+                    return self.failed(format!("{} is off and does not cool", objects[n]), None);
+                }
+                Some(_) => thread::sleep(Duration::from_millis(500)),
+            }
+        }
+    }
+
+    fn fans(&mut self) -> Outcome {
+        let mut fans: Vec<(String, String, String)> = Vec::new();
+        if self.has("fan") {
+            fans.push(("fan".into(), "M106 S255".into(), "M106 S0".into()));
+        }
+        for name in self.named("fan_generic") {
+            let set = |speed| format!("SET_FAN_SPEED FAN={name} SPEED={speed}");
+            fans.push((name.clone(), set(1), set(0)));
+        }
+        if fans.is_empty() {
+            return Outcome::Skipped("there is no fan that a command switches".into());
+        }
+        for (name, on, off) in &fans {
+            if let Err(outcome) = self.gcode(on, LONG) {
+                return outcome;
+            }
+            let until = Instant::now() + SOON;
+            while self.probe.fan(name).is_some_and(|fan| fan.rpm < 500.0) {
+                if Instant::now() > until {
+                    let section = self.own.config.section(name);
+                    let section = section.or_else(|| self.own.config.section(&format!("fan_generic {name}")));
+                    return self.failed(format!("{on}: the fan stands still"), section.map(|s| s.place.clone()));
+                }
+                thread::sleep(Duration::from_millis(50));
+            }
+            if let Err(outcome) = self.gcode(off, LONG) {
+                return outcome;
+            }
+        }
+        let names: Vec<&str> = fans.iter().map(|(name, ..)| name.as_str()).collect();
+        Outcome::Passed(names.join(", "))
+    }
+
+    fn lights(&mut self) -> Outcome {
+        let kinds = ["led", "neopixel", "dotstar", "pca9533", "pca9632"];
+        let names: Vec<String> = kinds.iter().flat_map(|kind| self.named(kind)).collect();
+        if names.is_empty() {
+            return Outcome::Skipped("there is no light".into());
+        }
+        for name in &names {
+            for color in ["RED=1 GREEN=0.5 BLUE=0", "RED=0 GREEN=0 BLUE=0"] {
+                if let Err(outcome) = self.gcode(&format!("SET_LED LED={name} {color}"), LONG) {
+                    return outcome;
+                }
+            }
+        }
+        Outcome::Passed(names.join(", "))
+    }
+
+    fn servo(&mut self) -> Outcome {
+        let names = self.named("servo");
+        if names.is_empty() {
+            return Outcome::Skipped("there is no servo".into());
+        }
+        for name in &names {
+            for angle in [90, 0] {
+                if let Err(outcome) = self.gcode(&format!("SET_SERVO SERVO={name} ANGLE={angle}"), LONG) {
+                    return outcome;
+                }
+            }
+        }
+        Outcome::Passed(names.join(", "))
+    }
+
+    fn leveled(&mut self, object: &str, command: &str) -> Outcome {
+        if !self.has(object) {
+            return Outcome::Skipped(format!("there is no [{object}]"));
+        }
+        if object == "bed_mesh" && !self.has("probe") {
+            return Outcome::Skipped("there is no probe".into());
+        }
+        let before = self.lost();
+        if let Err(outcome) = self.gcode("G28", LONG).and_then(|()| self.gcode(command, LONG)) {
+            return outcome;
+        }
+        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(command.into()))
+    }
+
+    fn probed(&mut self) -> Outcome {
+        if !self.has("probe") {
+            return Outcome::Skipped("there is no probe".into());
+        }
+        let before = self.lost();
+        let commands = ["G28", "PROBE_CALIBRATE", "ABORT"];
+        for command in commands {
+            if let Err(outcome) = self.gcode(command, LONG) {
+                return outcome;
+            }
+        }
+        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed("PROBE_CALIBRATE".into()))
+    }
+
+    fn shaped(&mut self) -> Outcome {
+        if !self.has("resonance_tester") && self.own.config.section("resonance_tester").is_none() {
+            return Outcome::Skipped("there is no [resonance_tester]".into());
+        }
+        match self.gcode("SHAPER_CALIBRATE", LONG) {
+            Ok(()) => Outcome::Passed("SHAPER_CALIBRATE".into()),
+            Err(outcome) => outcome,
+        }
+    }
+
+    fn macro_of(&self, names: &[&str]) -> Option<String> {
+        let macros = self.own.config.of_kind("gcode_macro").filter_map(|section| section.own_name());
+        macros.map(str::to_uppercase).find(|name| names.contains(&name.as_str()))
+    }
+
+    fn macros(&mut self) -> Outcome {
+        let found: Vec<String> = [self.macro_of(&STARTS), self.macro_of(&ENDS)].into_iter().flatten().collect();
+        if found.is_empty() {
+            return Outcome::Skipped("there is no START_PRINT and no END_PRINT".into());
+        }
+        let before = self.lost();
+        for name in &found {
+            // The usual names of the temperatures.
+            let with = "BED_TEMP=60 EXTRUDER_TEMP=200 BED=60 EXTRUDER=200 HOTEND=200 TOOL_TEMP=200";
+            if let Err(outcome) = self.gcode(&format!("{name} {with}"), LONG) {
+                return outcome;
+            }
+        }
+        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(found.join(", ")))
+    }
+
+    fn printed(&mut self) -> Outcome {
+        if !self.has("extruder") {
+            return Outcome::Skipped("there is no extruder".into());
+        }
+        let Ok(status) = self.host.query(&["toolhead"]) else { return self.failed("klippy does not answer", None) };
+        let [low, high] = ["axis_minimum", "axis_maximum"].map(|key| coordinates(&status["toolhead"][key]));
+        let (name, text) = match &self.attempt.gcode {
+            Some(path) => match files::read(path, GCODE_MIB) {
+                Ok(bytes) => (path.display().to_string(), String::from_utf8_lossy(&bytes).into_owned()),
+                Err(error) => return self.failed(format!("{}: {error}", path.display()), None),
+            },
+            None => ("a small square".to_owned(), small::square(low, high)),
+        };
+        let asked = match AskedPath::read(BufReader::new(text.as_bytes()), &name) {
+            Ok(asked) => asked,
+            Err(trouble) => return self.failed(trouble.to_string(), None),
+        };
+        let mut first = vec!["CLEAR_PAUSE".to_owned()];
+        first.retain(|_| self.has("pause_resume"));
+        if self.own.config.section("input_shaper").is_some() {
+            // A shaper rounds corners, as it should.
+            first.push("SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0".into());
+        }
+        let heats = self.attempt.gcode.is_none();
+        if heats {
+            first.push("G28".into());
+            let hot = self.targets().into_iter().find(|(name, _)| name == "extruder");
+            first.extend(hot.map(|(_, target)| format!("SET_HEATER_TEMPERATURE HEATER=extruder TARGET={target}")));
+        }
+        for command in &first {
+            if let Err(outcome) = self.gcode(command, LONG) {
+                return outcome;
+            }
+        }
+        if heats && let Err(outcome) = self.until_hot("extruder") {
+            return outcome;
+        }
+        let before = self.lost();
+        let (stop, stopped) = mpsc::channel::<()>();
+        let mut recorder = self.probe.recorder();
+        let watched = self.probe.clone();
+        let recorded = thread::spawn(move || {
+            while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
+                recorder.read(watched.now());
+            }
+            let late = u64::from(Ticks::from_ms(450).0);
+            recorder.read(Clock::from_ticks(watched.now().ticks() + late));
+            recorder
+        });
+        let lines: Vec<&str> = text.lines().collect();
+        let mut sent = Ok(());
+        for block in lines.chunks(200) {
+            sent = self.gcode_block(&block.join("\n"));
+            if sent.is_err() {
+                break;
+            }
+        }
+        let sent = sent.and_then(|()| self.gcode("M400", PRINT));
+        thread::sleep(Duration::from_millis(600));
+        drop(stop);
+        let Ok(recorder) = recorded.join() else { return self.failed("the path was not recorded", None) };
+        if let Err(outcome) = sent {
+            return outcome;
+        }
+        if let Some(outcome) = self.new_lost(&before) {
+            return outcome;
+        }
+        match compare(recorder.points(), &asked) {
+            Err(trouble) => self.failed(trouble.to_string(), None),
+            Ok(found) if found.all.greatest_mm > WITHIN_MM => {
+                let (mm, line) = (found.all.greatest_mm, found.all.line);
+                self.failed(format!("{name}, line {line}: the nozzle was {mm:.3} mm off"), None)
+            }
+            Ok(found) if found.ends_at_line.is_some() => {
+                let line = found.ends_at_line.unwrap_or_default();
+                self.failed(format!("{name}: the path ends at line {line}"), None)
+            }
+            Ok(found) => {
+                let (mm, length) = (found.all.greatest_mm, found.all.length_mm);
+                Outcome::Passed(format!("{name}: {length:.0} mm, at most {mm:.3} mm off"))
+            }
+        }
+    }
+
+    /// Sends a block of a file.
+    fn gcode_block(&mut self, block: &str) -> Result<(), Outcome> {
+        match self.host.gcode(block, PRINT) {
+            Ok(()) => Ok(()),
+            Err(Refused::Error(words)) => {
+                let words = self.why(words);
+                Err(self.failed(words, None))
+            }
+            Err(refused) => Err(self.failed(format!("the print stopped: {refused:?}"), None)),
+        }
+    }
+
+    fn until_hot(&mut self, heater: &str) -> Result<(), Outcome> {
+        let until = Instant::now() + HEAT;
+        loop {
+            let status = self.host.query(&[heater]).unwrap_or_default();
+            let [now, target] = ["temperature", "target"].map(|key| status[heater][key].as_f64().unwrap_or_default());
+            if (now - target).abs() < NEAR_K {
+                return Ok(());
+            }
+            if Instant::now() > until {
+                return Err(self.failed(format!("{heater} is at {now:.0} of {target} C"), None));
+            }
+            thread::sleep(Duration::from_millis(300));
+        }
+    }
+}
+
+/// The first three numbers of a list.
+fn coordinates(list: &Value) -> [f64; 3] {
+    [0, 1, 2].map(|n| list[n].as_f64().unwrap_or_default())
+}
+
+/// The klippy that is named, or the one of KLIPPER_DIR.
+///
+/// # Errors
+///
+/// There is none.
+pub(crate) fn klipper(named: Option<&Path>) -> Result<PathBuf, Trouble> {
+    let usual = || std::env::var_os("KLIPPER_DIR").map(PathBuf::from);
+    named.map(Path::to_owned).or_else(usual).ok_or_else(|| {
+        Trouble::new("--try needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
+    })
+}
+
+/// The Python that is named, that of KLIPPER_PYTHON, the one of Klipper's usual environment, or the system's.
+pub(crate) fn python(named: Option<&Path>, klipper: &Path) -> PathBuf {
+    let usual = || std::env::var_os("KLIPPER_PYTHON").map(PathBuf::from);
+    let beside = || {
+        let path = klipper.parent()?.join("klippy-env/bin/python");
+        path.is_file().then_some(path)
+    };
+    named.map(Path::to_owned).or_else(usual).or_else(beside).unwrap_or_else(|| "python3".into())
+}

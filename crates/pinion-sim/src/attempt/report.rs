@@ -1,0 +1,154 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What `--try` found: one line for each thing that it tried, then a verdict.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Display;
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use pinion::cli::page::{Page, print};
+use pinion::cli::terminal::ERASE_LINE;
+use pinion_linux::foreign::plain;
+use pinion_printer_config::Place;
+
+/// How a step ended.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Outcome {
+    Passed(String),
+    Failed {
+        cause: String,
+        place: Option<Place>,
+    },
+    /// It was not tried, and why.
+    Skipped(String),
+}
+
+/// A step.
+struct Step {
+    name: &'static str,
+    outcome: Outcome,
+    took: Duration,
+}
+
+/// The form of the report.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Form {
+    Lines,
+    Json,
+}
+
+/// All steps.
+pub(super) struct Report {
+    form: Form,
+    steps: Vec<Step>,
+}
+
+impl Report {
+    pub(super) fn new(form: Form) -> Report {
+        Report { form, steps: Vec::new() }
+    }
+
+    /// On a terminal, what is under way.
+    pub(super) fn progress(&self, doing: impl Display) {
+        let mut out = std::io::stdout();
+        if self.form == Form::Lines && out.is_terminal() {
+            let _ = write!(out, "\r{ERASE_LINE}  ...  {}", plain(&doing.to_string()));
+            let _ = out.flush();
+        }
+    }
+
+    /// A step ended.
+    pub(super) fn add(&mut self, name: &'static str, outcome: Outcome, since: Instant) {
+        let took = since.elapsed();
+        if self.form == Form::Lines {
+            let mut page = Page::default();
+            let line = match &outcome {
+                Outcome::Passed(seen) => format!("ok    {name:<12} {seen} ({:.1} s)", took.as_secs_f64()),
+                Outcome::Skipped(why) => format!("-     {name:<12} {why}"),
+                Outcome::Failed { cause, place: Some(place) } => format!("FAIL  {name:<12} {place}: {cause}"),
+                Outcome::Failed { cause, place: None } => format!("FAIL  {name:<12} {cause}"),
+            };
+            page.line(line);
+            self.erase();
+            if let Err(error) = print(&page) {
+                log::warn!("{error}");
+            }
+        }
+        self.steps.push(Step { name, outcome, took });
+    }
+
+    fn erase(&self) {
+        let mut out = std::io::stdout();
+        if out.is_terminal() {
+            let _ = write!(out, "\r{ERASE_LINE}");
+        }
+    }
+
+    fn failed(&self) -> impl Iterator<Item = &Step> {
+        self.steps.iter().filter(|step| matches!(step.outcome, Outcome::Failed { .. }))
+    }
+
+    /// Whether nothing failed.
+    pub(super) fn passed(&self) -> bool {
+        self.failed().next().is_none()
+    }
+
+    /// Writes the verdict, and a line for the CI.
+    pub(super) fn end(&self, printer: &Path, folder: &Path) {
+        let mut page = Page::default();
+        match self.form {
+            Form::Json => page = Page::json(&format!("{}\n", self.json(printer, folder))),
+            Form::Lines => {
+                let failed: Vec<&str> = self.failed().map(|step| step.name).collect();
+                let name = printer.display();
+                match failed[..] {
+                    [] => page.line(format_args!("{name} works here: everything that was tried passed")),
+                    _ => page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", "))),
+                }
+                page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));
+            }
+        }
+        // GitHub shows such a line at its place in the file.
+        if std::env::var_os("GITHUB_ACTIONS").is_some() && self.form == Form::Lines {
+            for step in self.failed() {
+                let Outcome::Failed { cause, place } = &step.outcome else { continue };
+                let at = place.as_ref().map_or_else(
+                    || format!("file={}", printer.display()),
+                    |place| format!("file={},line={}", place.file.display(), place.line),
+                );
+                page.line(format_args!("::error {at},title={}::{cause}", step.name));
+            }
+        }
+        if let Err(error) = print(&page) {
+            log::warn!("{error}");
+        }
+    }
+
+    fn json(&self, printer: &Path, folder: &Path) -> Value {
+        let steps = self.steps.iter().map(|step| {
+            let (result, text, place) = match &step.outcome {
+                Outcome::Passed(seen) => ("passed", seen, None),
+                Outcome::Skipped(why) => ("skipped", why, None),
+                Outcome::Failed { cause, place } => ("failed", cause, place.as_ref()),
+            };
+            json!({
+                "step": step.name,
+                "result": result,
+                "text": text,
+                "file": place.map(|place| place.file.display().to_string()),
+                "line": place.map(|place| place.line),
+                "seconds": (step.took.as_secs_f64() * 10.0).round() / 10.0,
+            })
+        });
+        json!({
+            "printer": printer.display().to_string(),
+            "passed": self.passed(),
+            "folder": folder.display().to_string(),
+            "steps": steps.collect::<Vec<Value>>(),
+        })
+    }
+}

@@ -1,0 +1,122 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The boards of a simulated printer: each has a link, a recording and threads of its own, in one process.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::getpid;
+
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::clock::Monotonic;
+use pinion_linux::sys;
+use pinion_runtime::{Helpers, LinkName, Options, Recording};
+use pinion_sim::{SimBoard, SimConfig};
+use pinion_trace::folder::folders;
+
+/// How long all boards have to open their links.
+const START: Duration = Duration::from_secs(10);
+
+/// The paths of the links: the first board's, and behind its name those of the others.
+pub(crate) fn links(first: &Path, config: &SimConfig) -> Vec<PathBuf> {
+    let beside = |name: &str| {
+        let mut path = first.as_os_str().to_owned();
+        path.push(format!("_{name}"));
+        PathBuf::from(path)
+    };
+    let others = config.mcus.iter().skip(1).map(|mcu| beside(&mcu.name));
+    std::iter::once(first.to_owned()).chain(others).collect()
+}
+
+/// What each board needs before the program has threads.
+pub(crate) type Started = (PathBuf, Recording, Helpers);
+
+/// Starts the helper processes of each board. Call it before any thread starts.
+///
+/// # Errors
+///
+/// There are threads already, or the kernel has no room.
+pub(crate) fn start(links: &[PathBuf], clock: Monotonic, realtime: bool) -> Result<Vec<Started>, Trouble> {
+    let start = |link: &PathBuf| {
+        let recording = Recording::new(clock, link, realtime, folders())?;
+        let helpers = Helpers::start(&recording, false, true, sys::SERVE)?;
+        Ok((link.clone(), recording, helpers))
+    };
+    links.iter().map(start).collect()
+}
+
+/// The boards beside the first.
+pub(crate) struct Others(Vec<JoinHandle<Result<(), Trouble>>>);
+
+impl Others {
+    /// Serves these boards on threads of their own, with the first board's options. Returns when a host may come to each
+    /// of them. If one of them ends, all end.
+    ///
+    /// # Errors
+    ///
+    /// The kernel has no room for a thread.
+    pub(crate) fn serve(boards: Vec<SimBoard>, started: Vec<Started>, options: &Options) -> Result<Others, Trouble> {
+        let (ready, count) = (Arc::new(AtomicUsize::new(0)), boards.len());
+        let mut threads = Vec::new();
+        for (board, (link, recording, helpers)) in boards.into_iter().zip(started) {
+            let sockets = pinion_runtime::socket_paths(&link);
+            let options = Options { link: LinkName::Pty(link), sockets, ..options.clone() };
+            let ready = ready.clone();
+            let name = format!("board {}", board.name());
+            let serve = move || {
+                let timing = board.timing();
+                let told = || {
+                    ready.fetch_add(1, Ordering::SeqCst);
+                };
+                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, told);
+                if let Err(trouble) = &ended {
+                    log::error!("{trouble}");
+                }
+                end_all();
+                ended
+            };
+            threads.push(pinion_runtime::started(thread::Builder::new().name(name).spawn(serve))?);
+        }
+        let others = Others(threads);
+        let step = Duration::from_millis(5);
+        let mut waited = Duration::ZERO;
+        while ready.load(Ordering::SeqCst) < count && waited < START && !others.0.iter().any(JoinHandle::is_finished) {
+            thread::sleep(step);
+            waited += step;
+        }
+        Ok(others)
+    }
+
+    /// Ends them, and says whether all ended in order. The first board has ended.
+    pub(crate) fn end(self) -> bool {
+        if !self.0.is_empty() {
+            end_all();
+        }
+        self.0.into_iter().fold(true, |right, thread| matches!(thread.join(), Ok(Ok(()))) && right)
+    }
+}
+
+/// SIGTERM to ourselves: each board ends in order, as by Ctrl-C.
+fn end_all() {
+    if let Err(error) = kill(getpid(), Signal::SIGTERM) {
+        log::error!("the other boards cannot be ended: {error}: press Ctrl-C");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_board_has_a_link_beside_the_first() {
+        let config = SimConfig::parse("[[mcu]]\nname = \"mcu\"\n[[mcu]]\nname = \"toolhead\"\n", "test").unwrap();
+        let paths = links(Path::new("/tmp/printer"), &config);
+        assert_eq!(paths, [Path::new("/tmp/printer"), Path::new("/tmp/printer_toolhead")]);
+        assert_eq!(links(Path::new("/tmp/a"), &SimConfig::default_printer()), [Path::new("/tmp/a")]);
+    }
+}

@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The options for a printer.cfg of one's own.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::Pace;
+use crate::attempt::{self, Attempt};
+use pinion_printer_config::Trouble;
+
+/// Options for a printer.cfg.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct OwnArgs {
+    /// With a printer.cfg: start a klippy on a copy of it, and try everything: ready, homed, heated, leveled, printed.
+    /// The exit status is 0 if nothing failed
+    #[arg(long = "try", conflicts_with_all = ["demo", "show", "print_config", "print_board"])]
+    pub(crate) attempt: bool,
+    /// The checkout of Klipper or Kalico for --try; KLIPPER_DIR by default
+    #[arg(long, value_name = "DIR")]
+    klipper: Option<PathBuf>,
+    /// The Python for that klippy; KLIPPER_PYTHON, or ~/klippy-env, by default
+    #[arg(long, value_name = "PROGRAM", requires = "attempt")]
+    python: Option<PathBuf>,
+    /// Print this file in --try, in place of a small square
+    #[arg(long, value_name = "FILE", requires = "attempt")]
+    gcode: Option<PathBuf>,
+    /// Try only this step, and that klippy is ready; may be given several times
+    #[arg(long, value_name = "STEP", requires = "attempt")]
+    only: Vec<String>,
+    /// Write the report of --try as JSON
+    #[arg(long, requires = "attempt")]
+    json: bool,
+    /// Heat as slowly as a real printer does
+    #[arg(long)]
+    real_heat: bool,
+    /// A description that lies over the one that comes out of printer.cfg
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) with: Option<PathBuf>,
+    /// The folder for klippy's copy and its logs; a new one in /tmp by default
+    #[arg(long, value_name = "DIR", conflicts_with = "in_place_pty")]
+    pub(crate) folder: Option<PathBuf>,
+    /// Make no copy: put each pty where `serial` of printer.cfg expects it
+    #[arg(long, conflicts_with = "attempt")]
+    pub(crate) in_place_pty: bool,
+}
+
+impl OwnArgs {
+    /// Whether an option needs a printer.cfg.
+    pub(crate) fn is_used(&self) -> bool {
+        self.attempt || self.with.is_some() || self.folder.is_some() || self.in_place_pty
+    }
+
+    pub(crate) fn pace(&self) -> Pace {
+        if self.real_heat { Pace::Real } else { Pace::Fast }
+    }
+
+    /// The klippy that is named, for the command that a user copies.
+    pub(crate) fn klipper(&self) -> Option<&Path> {
+        self.klipper.as_deref()
+    }
+
+    /// What to try.
+    ///
+    /// # Errors
+    ///
+    /// There is no klippy.
+    pub(crate) fn attempt(&self, realtime: bool) -> Result<Option<Attempt>, Trouble> {
+        if !self.attempt {
+            return Ok(None);
+        }
+        let klipper = attempt::klipper(self.klipper.as_deref())?;
+        let python = attempt::python(self.python.as_deref(), &klipper);
+        Ok(Some(Attempt {
+            klipper,
+            python,
+            gcode: self.gcode.clone(),
+            only: self.only.clone(),
+            json: self.json,
+            realtime,
+        }))
+    }
+}

@@ -1,0 +1,283 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Probes, lights, sensors, displays and other things.
+
+#![forbid(unsafe_code)]
+
+use pinion_printer_config::{Limit, Section, Trouble};
+
+use super::description::Entry;
+use super::translate::Translator;
+
+impl Translator<'_> {
+    pub(super) fn devices(&mut self) -> Result<(), Trouble> {
+        for section in self.config.sections() {
+            self.device(section)?;
+        }
+        Ok(())
+    }
+
+    fn device(&mut self, section: &Section) -> Result<(), Trouble> {
+        match section.kind() {
+            "probe" | "smart_effector" => self.probe(section),
+            "bltouch" => self.bltouch(section),
+            "probe_eddy_current" => self.eddy(section),
+            "filament_switch_sensor" => self.filament_switch(section),
+            "filament_motion_sensor" => self.filament_motion(section),
+            "servo" => self.servo(section),
+            "dotstar" => self.dotstar(section),
+            "led" => self.led(section),
+            "output_pin" | "pwm_tool" | "pwm_cycle_time" => self.output(section),
+            "display" => self.display(section),
+            "gcode_button" => self.button(section),
+            "adxl345" => self.accelerometer(section),
+            "angle" => self.angle(section),
+            "adc_scaled" => self.scaled(section),
+            "mcp4018" | "mcp4451" | "pca9533" | "pca9632" | "sx1509" => self.i2c_register(section),
+            "ad5206" | "dac084S085" => self.dac(section),
+            _ => Ok(()),
+        }
+    }
+
+    fn name_of(&mut self, kind: &str, section: &Section) -> String {
+        let wanted = section.own_name().unwrap_or(section.kind()).to_owned();
+        self.out.name(kind, &wanted)
+    }
+
+    /// A probe's offsets from the nozzle.
+    fn offsets(part: Entry, section: &Section) -> Result<Entry, Trouble> {
+        let mut part = part;
+        for axis in ["x", "y", "z"] {
+            let key = format!("{axis}_offset");
+            let mm = section.number(&key, Limit::Any)?.unwrap_or(0.0);
+            part = part.set(&format!("{axis}_offset_mm"), mm);
+        }
+        Ok(part)
+    }
+
+    fn probe(&mut self, section: &Section) -> Result<(), Trouble> {
+        if section.kind() == "probe" {
+            section.required("z_offset")?;
+        }
+        let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
+        let part = Entry::default().set("kind", "probe").set("pin", pin);
+        self.out.add("part", Translator::offsets(part, section)?);
+        Ok(())
+    }
+
+    fn bltouch(&mut self, section: &Section) -> Result<(), Trouble> {
+        section.required("z_offset")?;
+        let [sensor, control] = ["sensor_pin", "control_pin"].map(|key| self.take(section, key));
+        let (Some(sensor), Some(control)) = (sensor?, control?) else {
+            return section.required("sensor_pin").and(section.required("control_pin")).map(drop);
+        };
+        let part = Entry::default().set("kind", "bltouch").set("sensor_pin", sensor).set("control_pin", control);
+        self.out.add("part", Translator::offsets(part, section)?);
+        Ok(())
+    }
+
+    fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
+        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let address = section.whole("i2c_address", 0)?.unwrap_or(42);
+        let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
+        for axis in ["x", "y"] {
+            let mm = section.number(&format!("{axis}_offset"), Limit::Any)?.unwrap_or(0.0);
+            part = part.set(&format!("{axis}_offset_mm"), mm);
+        }
+        part = part.set_if("intb_pin", self.take(section, "intb_pin")?);
+        let part = part.set("coil_mm", 2.5).set("far_hz", 3_100_000.0).set("near_hz", 300_000.0).set("fade_mm", 3.0);
+        self.out.add("part", part.set("drive_current", 16));
+        Ok(())
+    }
+
+    fn filament_switch(&mut self, section: &Section) -> Result<(), Trouble> {
+        // There is filament.
+        self.level(section, "switch_pin", true)
+    }
+
+    fn filament_motion(&mut self, section: &Section) -> Result<(), Trouble> {
+        let axis = section.text("extruder").and_then(|extruder| self.axes.get(extruder)).cloned();
+        let Some(axis) = axis else { return self.level(section, "switch_pin", true) };
+        let Some(pin) = self.take(section, "switch_pin")? else { return Ok(()) };
+        let length = section.number("detection_length", Limit::Above(0.0))?.unwrap_or(7.0);
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "spool").set("name", name).set("axis", axis);
+        let part = part.set("length_mm", 330_000.0).set("encoder_pin", pin).set("encoder_mm", length / 4.0);
+        self.out.add("part", part);
+        Ok(())
+    }
+
+    /// An input that stays at a level.
+    fn level(&mut self, section: &Section, key: &str, level: bool) -> Result<(), Trouble> {
+        if let Some(pin) = self.take(section, key)? {
+            let name = self.name_of("input", section);
+            self.out.add("input", Entry::default().set("name", name).set("pin", pin).set("level", level));
+        }
+        Ok(())
+    }
+
+    fn servo(&mut self, section: &Section) -> Result<(), Trouble> {
+        let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
+        let us = |key: &str, default: f64| {
+            section.number(key, Limit::Above(0.0)).map(|seconds| seconds.map_or(default, |seconds| seconds * 1e6))
+        };
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "servo").set("name", name).set("pin", pin);
+        let part = part.set("min_pulse_us", us("minimum_pulse_width", 1000.0)?);
+        let part = part.set("max_pulse_us", us("maximum_pulse_width", 2000.0)?);
+        let degrees = section.number("maximum_servo_angle", Limit::Above(0.0))?.unwrap_or(180.0);
+        self.out.add("part", part.set("travel_degrees", degrees));
+        Ok(())
+    }
+
+    fn dotstar(&mut self, section: &Section) -> Result<(), Trouble> {
+        let [data, clock] = ["data_pin", "clock_pin"].map(|key| self.take(section, key));
+        if let (Some(data), Some(clock)) = (data?, clock?) {
+            let name = self.name_of("part", section);
+            let count = section.whole("chain_count", 1)?.unwrap_or(1);
+            let part = Entry::default().set("kind", "apa102").set("name", name).set("count", count);
+            self.out.add("part", part.set("data_pin", data).set("clock_pin", clock));
+        }
+        Ok(())
+    }
+
+    /// Strips on a data line each: an SPI bus of which only the output is in use. They come last, because klippy takes the
+    /// first bus where a section names none.
+    pub(super) fn strips(&mut self) -> Result<(), Trouble> {
+        for section in self.config.of_kind("neopixel") {
+            let Some(pin) = self.take(section, "pin")? else { continue };
+            let name = self.name_of("part", section);
+            let order = section.list("color_order", ',').first().map_or("GRB".to_owned(), |order| order.to_uppercase());
+            let count = section.whole("chain_count", 1)?.unwrap_or(1);
+            self.out.add("spi_bus", Entry::default().set("name", pin.as_str()));
+            let part = Entry::default().set("kind", "ws2812").set("name", name).set("count", count);
+            self.out.add("part", part.set("bus", pin).set("color_order", order));
+        }
+        Ok(())
+    }
+
+    fn led(&mut self, section: &Section) -> Result<(), Trouble> {
+        let keys = [("red_pin", "red_pin"), ("green_pin", "green_pin"), ("blue_pin", "blue_pin"), ("white_pin", "pin")];
+        let name = self.name_of("led", section);
+        let mut entry = Entry::default().set("name", name);
+        for (klippys, ours) in keys {
+            entry = entry.set_if(ours, self.take(section, klippys)?);
+        }
+        if entry.0.len() > 1 {
+            self.out.add("led", entry);
+        }
+        Ok(())
+    }
+
+    fn output(&mut self, section: &Section) -> Result<(), Trouble> {
+        if let Some(pin) = self.take(section, "pin")? {
+            let name = self.name_of("output", section);
+            self.out.add("output", Entry::default().set("name", name).set("pin", pin));
+        }
+        Ok(())
+    }
+
+    fn display(&mut self, section: &Section) -> Result<(), Trouble> {
+        for key in ["click_pin", "back_pin", "up_pin", "down_pin", "kill_pin"] {
+            // An analog button has a range of resistances, and is not pressed.
+            match section.text(&format!("analog_range_{key}")) {
+                Some(_) => self.fixed(section, key, 1.0)?,
+                None => self.level(section, key, false)?,
+            }
+        }
+        let kind = section.text("lcd_type").unwrap_or_default();
+        if !["ssd1306", "sh1106"].contains(&kind) {
+            return Ok(());
+        }
+        if section.text("cs_pin").is_none() {
+            let Some(bus) = self.i2c(section)? else { return Ok(()) };
+            let name = self.name_of("part", section);
+            let address = section.whole("i2c_address", 0)?.unwrap_or(60);
+            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            let part = part.set("address", address).set_if("reset_pin", self.take(section, "reset_pin")?);
+            self.out.add("part", part);
+        } else {
+            let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+            let name = self.name_of("part", section);
+            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            let part = part.set_if("select_pin", select).set_if("dc_pin", self.take(section, "dc_pin")?);
+            let part = part.set_if("reset_pin", self.take(section, "reset_pin")?);
+            self.out.add("part", part);
+        }
+        Ok(())
+    }
+
+    fn button(&mut self, section: &Section) -> Result<(), Trouble> {
+        match section.text("analog_range") {
+            Some(_) => self.fixed(section, "pin", 1.0),
+            None => self.level(section, "pin", false),
+        }
+    }
+
+    /// An ADC channel that reads a fixed fraction of its reference.
+    fn fixed(&mut self, section: &Section, key: &str, fraction: f64) -> Result<(), Trouble> {
+        if let Some(pin) = self.take(section, key)? {
+            let name = self.name_of("analog", section);
+            self.out.add("analog", Entry::default().set("name", name).set("pin", pin).set("fraction", fraction));
+        }
+        Ok(())
+    }
+
+    fn scaled(&mut self, section: &Section) -> Result<(), Trouble> {
+        self.fixed(section, "vref_pin", 1.0)?;
+        self.fixed(section, "vssa_pin", 0.0)
+    }
+
+    fn accelerometer(&mut self, section: &Section) -> Result<(), Trouble> {
+        section.required("cs_pin")?;
+        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        let shaken =
+            |axis: &str, hz: f64| Entry::default().set("axis", axis).set("hz", hz).set("damping_ratio", 0.06).0;
+        let mut part = Entry::default().set("kind", "adxl345").set("bus", bus).set_if("select_pin", select);
+        for (axis, hz) in [("x", 52.0), ("y", 43.0)] {
+            if self.axes.values().any(|name| name == axis) {
+                part = part.set(axis, shaken(axis, hz));
+            }
+        }
+        self.out.add("part", part);
+        Ok(())
+    }
+
+    fn angle(&mut self, section: &Section) -> Result<(), Trouble> {
+        let chip = section.required("sensor_type")?.to_owned();
+        let Some(axis) = section.text("stepper").and_then(|stepper| self.axes.get(stepper)).cloned() else {
+            return Ok(());
+        };
+        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        let part = Entry::default().set("kind", "angle_sensor").set("chip", chip).set("axis", axis);
+        self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
+        Ok(())
+    }
+
+    fn i2c_register(&mut self, section: &Section) -> Result<(), Trouble> {
+        let kind = section.kind();
+        let usual = match kind {
+            "mcp4018" => 0x2f,
+            "pca9632" => 98,
+            "pca9533" => 98,
+            _ => {
+                section.required("i2c_address")?;
+                0
+            }
+        };
+        let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
+        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
+        self.out.add("part", part.set("address", address));
+        Ok(())
+    }
+
+    fn dac(&mut self, section: &Section) -> Result<(), Trouble> {
+        section.required("enable_pin")?;
+        let Some((bus, select)) = self.spi(section, "enable_pin")? else { return Ok(()) };
+        let name = self.name_of("part", section);
+        let part = Entry::default().set("kind", "spi_dac").set("name", name).set("chip", section.kind().to_lowercase());
+        self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
+        Ok(())
+    }
+}

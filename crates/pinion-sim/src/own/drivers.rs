@@ -1,0 +1,73 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Stepper drivers with a bus.
+
+#![forbid(unsafe_code)]
+
+use pinion_printer_config::{Section, Trouble};
+
+use super::description::Entry;
+use super::translate::Translator;
+
+impl Translator<'_> {
+    pub(super) fn drivers(&mut self) -> Result<(), Trouble> {
+        for section in self.config.sections() {
+            match section.kind() {
+                kind @ ("tmc2130" | "tmc2660" | "tmc5160" | "tmc2240") if section.text("uart_pin").is_none() => {
+                    self.by_spi(section, kind)?;
+                }
+                kind @ ("tmc2208" | "tmc2209" | "tmc2240") => self.by_uart(section, kind)?,
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// The axis of a driver's motor. klippy refuses a driver without one.
+    fn driven(&mut self, section: &Section) -> Result<String, Trouble> {
+        let stepper = section.name.split_once(' ').map_or("", |(_, stepper)| stepper).trim();
+        self.axes.get(stepper).cloned().ok_or_else(|| {
+            let cause = format!("Could not find config section '[{stepper}]' required by TMC driver");
+            Trouble::new(cause).of(&section.place).remedy("add it, or remove the driver")
+        })
+    }
+
+    fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
+        let axis = self.driven(section)?;
+        section.required("cs_pin")?;
+        if section.whole("chain_length", 2)?.is_some() {
+            self.note(section, "is in a chain of drivers, which is not simulated", "its driver does not answer");
+            return Ok(());
+        }
+        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
+        part = part.set_if("select_pin", select);
+        let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
+        for key in diags {
+            part = part.set_if(key, self.take(section, key)?);
+        }
+        self.out.add("part", part);
+        Ok(())
+    }
+
+    fn by_uart(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
+        let axis = self.driven(section)?;
+        section.required("uart_pin")?;
+        let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
+        if section.text("select_pins").is_some() {
+            self.note(section, "is behind a multiplexer, which is not simulated", "its driver does not answer");
+            return Ok(());
+        }
+        self.take_pin(section, &pin);
+        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("uart_pin", pin.to_string());
+        if let Some(tx) = self.pin(section, "tx_pin")?.filter(|pin| self.is_real(pin)) {
+            self.take_pin(section, &tx);
+            part = part.set("tx_pin", tx.to_string());
+        }
+        if kind == "tmc2209" {
+            part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
+            part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
+        }
+        self.out.add("part", part);
+        Ok(())
+    }
+}

@@ -1,0 +1,214 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Heaters, their sensors, and fans.
+
+#![forbid(unsafe_code)]
+
+use pinion_printer_config::{Limit, Section, Trouble};
+
+use super::description::Entry;
+use super::sensors::{mcu_at_40, sensor};
+use super::translate::{Pace, Translator};
+
+/// Temperature of the surroundings.
+const AMBIENT_CELSIUS: f64 = 25.0;
+/// Full power could heat this much above the highest permitted temperature, as a share of it.
+const RESERVE: f64 = 1.3;
+/// What the mass of a heater stores. Only its ratio to the power counts.
+const J_PER_K: f64 = 15.0;
+/// klippy's PID parameters are for a power of 0 to this.
+const PID_BASE: f64 = 255.0;
+
+/// The kinds of a section with a sensor, and their highest temperatures if the section has none.
+fn has_sensor(kind: &str) -> bool {
+    let is_extruder = kind.strip_prefix("extruder").is_some_and(|rest| rest.chars().all(|c| c.is_ascii_digit()));
+    is_extruder
+        || [
+            "heater_bed",
+            "heater_generic",
+            "temperature_sensor",
+            "temperature_fan",
+            "z_thermal_adjust",
+            "temperature_probe",
+        ]
+        .contains(&kind)
+}
+
+impl Translator<'_> {
+    pub(super) fn heat(&mut self) -> Result<(), Trouble> {
+        for section in self.config.sections().iter().filter(|section| has_sensor(section.kind())) {
+            self.heater(section)?;
+        }
+        for section in self.config.sections() {
+            self.fan(section)?;
+        }
+        Ok(())
+    }
+
+    fn heater(&mut self, section: &Section) -> Result<(), Trouble> {
+        let Some(kind) = section.text("sensor_type") else {
+            // An extruder may use the heater of another one.
+            return match section.text("heater_pin") {
+                Some(_) => section.required("sensor_type").map(drop),
+                None => Ok(()),
+            };
+        };
+        let klippys = section.own_name().unwrap_or(&section.name).to_owned();
+        let name = self.out.name("heater", &klippys);
+        // A pin of another chip drives nothing here, and klippy needs one.
+        let nothing = section.text("heater_pin").map(|_| self.out.name("nothing", &format!("nothing_{name}")));
+        let pin = self.take(section, "heater_pin")?.or(nothing);
+        let min = section.number("min_temp", Limit::Any)?.unwrap_or(0.0);
+        let max = section.number("max_temp", Limit::Any)?.unwrap_or(100.0);
+        let start = AMBIENT_CELSIUS.clamp(min.min(max), max.max(min));
+        let mut entry = Entry::default().set("name", name.as_str()).set("min_celsius", min).set("max_celsius", max);
+        if start != AMBIENT_CELSIUS {
+            entry = entry.set("ambient_celsius", start);
+        }
+        entry = match &pin {
+            Some(pin) => {
+                let rate = self.kelvin_per_second(section)?;
+                let watts = rate * J_PER_K;
+                let reach = (RESERVE * (max - AMBIENT_CELSIUS)).max(50.0);
+                entry
+                    .set("pin", pin.as_str())
+                    .set("heater_watts", watts)
+                    .set("heat_capacity_j_per_k", J_PER_K)
+                    .set("loss_w_per_k", watts / reach)
+            }
+            None => {
+                let loss = J_PER_K / 60.0;
+                entry.set("heater_watts", 0.0).set("heat_capacity_j_per_k", J_PER_K).set("loss_w_per_k", loss)
+            }
+        };
+        if let Some(with) = sensor(self.config, section, Entry::default())? {
+            let Some(sensor_pin) = self.take(section, "sensor_pin")? else {
+                // Another section has the sensor already, or klippy refuses the pin.
+                section.required("sensor_pin")?;
+                return Ok(());
+            };
+            with.0.into_iter().for_each(|(key, value)| _ = entry.0.insert(key, value));
+            self.heaters.insert(klippys, name);
+            self.out.add("heater", entry.set("sensor_pin", sensor_pin));
+            return Ok(());
+        }
+        match kind {
+            "temperature_mcu" => self.mcu_thermometer(section),
+            "temperature_host" | "temperature_combined" => Ok(()),
+            _ => {
+                self.heaters.insert(klippys, name.clone());
+                self.out.add("heater", entry);
+                self.chip_thermometer(section, kind, &name)
+            }
+        }
+    }
+
+    /// The MCU's own thermometer: an ADC channel of the MCU.
+    fn mcu_thermometer(&mut self, section: &Section) -> Result<(), Trouble> {
+        let mcu = section.text("sensor_mcu").unwrap_or(pinion_printer_config::pins::MAIN).to_owned();
+        let pin = self.pin_of(section, "sensor_mcu", &format!("{mcu}:ADC_TEMPERATURE"))?;
+        let fraction = mcu_at_40(self.chip(&mcu));
+        if let Some(pin) = self.take_pin(section, &pin) {
+            let name = self.out.name("analog", &format!("{mcu}_celsius"));
+            self.out.add("analog", Entry::default().set("name", name).set("pin", pin).set("fraction", fraction));
+        }
+        Ok(())
+    }
+
+    /// A sensor that is a chip of its own.
+    fn chip_thermometer(&mut self, section: &Section, kind: &str, heater: &str) -> Result<(), Trouble> {
+        let part = Entry::default().set("heater", heater);
+        let number = |key: &str, default: f64| section.number(key, Limit::Any).map(|n| n.unwrap_or(default));
+        match kind {
+            "MAX6675" | "MAX31855" | "MAX31856" | "MAX31865" => {
+                let Some((bus, select)) = self.spi(section, "sensor_pin")? else { return Ok(()) };
+                let name = self.out.name("part", heater);
+                let part = part.set("kind", "thermocouple").set("chip", kind.to_lowercase()).set("name", name);
+                let part = part.set("bus", bus).set_if("select_pin", select);
+                let part = match kind {
+                    "MAX31865" => {
+                        let part = part.set("rtd_ohm", number("rtd_nominal_r", 100.0)?);
+                        part.set("reference_ohm", number("rtd_reference_r", 430.0)?)
+                    }
+                    _ => part,
+                };
+                self.out.add("part", part);
+            }
+            "DS18B20" => {
+                let serial = section.required("serial_no")?;
+                let name = self.out.name("part", heater);
+                self.out.add("part", part.set("kind", "ds18b20").set("name", name).set("serial", serial));
+            }
+            "BME280" | "HTU21D" | "SHT21" | "SI7013" | "SI7020" | "SI7021" | "SHT3X" | "AHT10" | "LM75" => {
+                let (chip, address) = match kind {
+                    "BME280" => ("bme280", 118),
+                    "SHT3X" => ("sht3x", 68),
+                    "AHT10" => ("aht10", 56),
+                    "LM75" => ("lm75", 72),
+                    _ => ("htu21d", 64),
+                };
+                let address = section.whole("i2c_address", 0)?.unwrap_or(address);
+                let Some(bus) = self.i2c(section)? else { return Ok(()) };
+                let name = self.out.name("part", heater);
+                let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
+                self.out.add("part", part.set("address", address));
+            }
+            _ => {
+                let known = self.config.sections().iter().any(|section| section.name == kind);
+                if !known {
+                    return Err(section
+                        .trouble("sensor_type", format!("Unknown temperature sensor '{kind}'"))
+                        .remedy("correct it, or add [thermistor] or [adc_temperature]"));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// How fast full power heats: as fast as the section's control can hold.
+    fn kelvin_per_second(&self, section: &Section) -> Result<f64, Trouble> {
+        let is_bed = section.kind() == "heater_bed";
+        let usual = match (self.pace, is_bed) {
+            (Pace::Real, true) => 0.5,
+            (Pace::Real, false) => 2.5,
+            (Pace::Fast, true) => 2.0,
+            (Pace::Fast, false) => 8.0,
+        };
+        let slowest = if is_bed { 0.3 } else { 1.0 };
+        let number = |key: &str| section.number(key, Limit::Any).map(|number| number.filter(|number| *number > 0.0));
+        if section.text("control") != Some("pid") {
+            return Ok(if self.pace == Pace::Fast { usual / 2.0 } else { usual });
+        }
+        // With klippy's delay of half a second, a stronger gain would swing.
+        let by_p = number("pid_kp")?.map_or(usual, |kp| PID_BASE / kp);
+        let by_d = number("pid_kd")?.map_or(usual, |kd| 2.0 * PID_BASE / kd);
+        Ok(usual.min(by_p).min(by_d).max(slowest))
+    }
+
+    fn fan(&mut self, section: &Section) -> Result<(), Trouble> {
+        let kind = section.kind();
+        if !["fan", "heater_fan", "controller_fan", "fan_generic", "temperature_fan", "heated_fan"].contains(&kind) {
+            return Ok(());
+        }
+        let wanted = section.own_name().unwrap_or("fan").to_owned();
+        let Some(pin) = self.take(section, "pin")? else {
+            return section.required("pin").map(drop);
+        };
+        let name = self.out.name("fan", &wanted);
+        let tachometer = self.take(section, "tachometer_pin")?;
+        let entry = Entry::default().set("name", name).set("pin", pin).set("max_rpm", 5000.0);
+        let entry = entry.set_if("enable_pin", self.take(section, "enable_pin")?);
+        let entry = match tachometer {
+            Some(pin) => entry
+                .set("tachometer_pin", pin)
+                .set("pulses_per_revolution", section.whole("tachometer_ppr", 1)?.unwrap_or(2)),
+            None => entry,
+        };
+        let cools = self.heaters.get(&wanted).filter(|_| kind == "temperature_fan").cloned();
+        let entry = match cools {
+            Some(heater) => entry.set("cools", heater).set("cooling_w_per_k", 0.5),
+            None => entry,
+        };
+        self.out.add("fan", entry);
+        Ok(())
+    }
+}

@@ -1,0 +1,462 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Motors, their kinematics, and endstops at the positions that the configuration has.
+
+#![forbid(unsafe_code)]
+
+use pinion_printer_config::{Limit, Section, Trouble};
+
+use super::description::Entry;
+use super::translate::Translator;
+
+/// Where a rail begins, in front of its endstop.
+const BEFORE_ENDSTOP_MM: f64 = 15.0;
+/// How high the nozzle begins over the bed.
+const START_HEIGHT_MM: f64 = 8.0;
+/// How far motors of one z axis are apart at first, if klippy can level them.
+const TILT_MM: [f64; 4] = [0.0, 0.4, -0.3, 0.5];
+/// A motor without an end of its own.
+const FREE_MM: f64 = 1000.0;
+
+/// A rail's travel and its endstop.
+struct Rail {
+    min: f64,
+    max: f64,
+    endstop: f64,
+    at_max: bool,
+}
+
+/// What an endstop's pin is.
+enum Endstop {
+    /// A switch at a pin of an MCU.
+    Switch(String),
+    /// The driver sees the motor stall.
+    Sensorless,
+    /// The probe, or nothing.
+    Other,
+}
+
+impl<'a> Translator<'a> {
+    pub(super) fn motion(&mut self) -> Result<(), Trouble> {
+        let Some(printer) = self.config.section("printer") else {
+            let cause = "Option 'kinematics' in section 'printer' must be specified";
+            return Err(Trouble::new(cause).remedy("add [printer]"));
+        };
+        let kind = printer.required("kinematics")?.to_owned();
+        match kind.as_str() {
+            "cartesian" | "corexy" | "corexz" | "hybrid_corexy" | "hybrid_corexz" | "limited_cartesian"
+            | "limited_corexy" | "limited_corexz" => {
+                for axis in ["x", "y", "z"] {
+                    self.rail(axis)?;
+                }
+                self.dual_carriage()?;
+                let kind = kind.strip_prefix("limited_").unwrap_or(&kind);
+                self.out.set("kinematics", Entry::default().set("kind", kind));
+            }
+            "generic_cartesian" => self.generic()?,
+            "delta" => self.delta(printer)?,
+            "deltesian" => self.deltesian()?,
+            "polar" => self.polar()?,
+            "rotary_delta" => self.rotary_delta(printer)?,
+            "winch" => self.winch()?,
+            "none" => self.out.set("kinematics", Entry::default().set("kind", "none")),
+            _ => {
+                let cause = format!("Error loading kinematics '{kind}'");
+                return Err(printer.trouble("kinematics", cause).remedy("name one of Klipper's kinematics"));
+            }
+        }
+        self.other_motors()
+    }
+
+    /// Steps for each millimeter, or for each radian of a motor without `rotation_distance`.
+    fn steps_per_mm(section: &Section) -> Result<f64, Trouble> {
+        let mut gear = 1.0;
+        for ratio in section.list("gear_ratio", ',') {
+            let numbers = ratio
+                .split_once(':')
+                .and_then(|(a, b)| Some((a.trim().parse::<f64>().ok()?, b.trim().parse::<f64>().ok()?)));
+            let Some((driven, driving)) = numbers.filter(|(a, b)| *a > 0.0 && *b > 0.0) else {
+                let cause = format!("Unable to parse option 'gear_ratio' in section '{}'", section.name);
+                return Err(section.trouble("gear_ratio", cause).remedy("write it as 80:16"));
+            };
+            gear *= driven / driving;
+        }
+        let distance = section.number("rotation_distance", Limit::Above(0.0))?;
+        if distance.is_none() && section.text("gear_ratio").is_none() {
+            section.required("rotation_distance")?;
+        }
+        section.required("microsteps")?;
+        let microsteps = section.whole("microsteps", 1)?.unwrap_or(16);
+        let full = section.whole("full_steps_per_rotation", 1)?.unwrap_or(200);
+        Ok((full as f64) * (microsteps as f64) * gear / distance.unwrap_or(std::f64::consts::TAU))
+    }
+
+    /// The pins of a motor. `name` is the axis of the description.
+    pub(super) fn motor(&mut self, section: &Section, name: &str) -> Result<Entry, Trouble> {
+        let steps_per_mm = Translator::steps_per_mm(section)?;
+        section.required("step_pin")?;
+        section.required("dir_pin")?;
+        let mut entry = Entry::default().set("name", name).set("steps_per_mm", steps_per_mm);
+        entry = entry.set("microsteps", section.whole("microsteps", 1)?.unwrap_or(16));
+        for key in ["step_pin", "dir_pin"] {
+            let pin = self.pin(section, key)?;
+            let taken = pin.as_ref().and_then(|pin| self.take_pin(section, pin));
+            let Some(text) = taken else {
+                let named = pin.map(|pin| pin.name).unwrap_or_default();
+                let is_known = self.pin(section, key)?.is_some_and(|pin| self.is_real(&pin));
+                let cause = match is_known {
+                    true => format!("pin {named} used multiple times in config"),
+                    false => format!("Unknown pin chip name in '{}'", section.text(key).unwrap_or_default()),
+                };
+                return Err(section.trouble(key, cause).remedy("name a pin of its own"));
+            };
+            entry = entry.set(key, text);
+        }
+        self.axes.insert(section.name.clone(), name.to_owned());
+        Ok(entry.set_if("enable_pin", self.take_enable(section, "enable_pin")?))
+    }
+
+    /// What is at a rail's `endstop_pin`.
+    fn endstop(&mut self, section: &Section) -> Result<Endstop, Trouble> {
+        let Some(pin) = self.pin(section, "endstop_pin")? else { return Ok(Endstop::Other) };
+        if pin.chip.starts_with("tmc") {
+            return Ok(Endstop::Sensorless);
+        }
+        Ok(self.take_pin(section, &pin).map_or(Endstop::Other, Endstop::Switch))
+    }
+
+    /// The travel of a rail, as klippy's `GenericPrinterRail` reads it.
+    fn travel(&mut self, section: &Section) -> Result<Rail, Trouble> {
+        let min = section.number("position_min", Limit::Any)?.unwrap_or(0.0);
+        section.required("position_max")?;
+        let max = section.number("position_max", Limit::Above(min))?.unwrap_or(min + 1.0);
+        let by_probe = self.pin(section, "endstop_pin")?.is_some_and(|pin| pin.chip == "probe");
+        let endstop = match section.number("position_endstop", Limit::Any)? {
+            Some(endstop) => endstop,
+            None if by_probe => 0.0f64.clamp(min, max),
+            None => section.required("position_endstop").map(|_| 0.0)?,
+        };
+        if endstop < min || endstop > max {
+            let cause =
+                format!("position_endstop in section '{}' must be between position_min and position_max", section.name);
+            return Err(section.trouble("position_endstop", cause).remedy("correct one of them"));
+        }
+        let at_max = match section.truth("homing_positive_dir")? {
+            Some(positive) => positive,
+            None if endstop <= min + (max - min) / 4.0 => false,
+            None if endstop >= max - (max - min) / 4.0 => true,
+            None => {
+                let cause = format!("Unable to infer homing_positive_dir in section '{}'", section.name);
+                return Err(section.trouble("position_endstop", cause).remedy("add homing_positive_dir"));
+            }
+        };
+        Ok(Rail { min, max, endstop, at_max })
+    }
+
+    /// The keys of a rail's travel and endstop.
+    fn with_rail(entry: Entry, rail: &Rail, endstop: &Endstop, start: f64) -> Entry {
+        let end = if rail.at_max { "max" } else { "min" };
+        let (mut min, mut max) = (rail.min, rail.max);
+        let mut overtravel = 3.0;
+        match endstop {
+            Endstop::Switch(_) => {}
+            // The stop is where klippy believes it to be.
+            Endstop::Sensorless if rail.at_max => {
+                (max, overtravel) = (rail.endstop, 0.0);
+            }
+            Endstop::Sensorless => (min, overtravel) = (rail.endstop, 0.0),
+            Endstop::Other => overtravel = 5.0,
+        }
+        let entry = entry.set("min_mm", min).set("travel_mm", max).set("overtravel_mm", overtravel);
+        let entry = entry.set("start_mm", start.clamp(min, max));
+        match endstop {
+            Endstop::Switch(pin) => {
+                entry.set("endstop_pin", pin.as_str()).set("endstop_at", end).set("endstop_mm", rail.endstop)
+            }
+            _ => entry,
+        }
+    }
+
+    /// An axis of a cartesian printer, with all of its motors.
+    fn rail(&mut self, axis: &str) -> Result<(), Trouble> {
+        let Some(section) = self.config.section(&format!("stepper_{axis}")) else {
+            let cause = format!("Option 'step_pin' in section 'stepper_{axis}' must be specified");
+            return Err(Trouble::new(cause).remedy(format!("add [stepper_{axis}]")));
+        };
+        let rail = self.travel(section)?;
+        let entry = self.motor(section, axis)?;
+        let endstop = self.endstop(section)?;
+        let start = match (axis, rail.at_max) {
+            ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
+            (_, true) => rail.endstop - BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0),
+            (_, false) => rail.endstop + BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0),
+        };
+        let others: Vec<&Section> =
+            (1..100).map_while(|n| self.config.section(&format!("stepper_{axis}{n}"))).collect();
+        let places = if axis == "z" { self.z_places(1 + others.len())? } else { None };
+        let place = |entry: Entry, n: usize| match places.as_ref().and_then(|places| places.get(n)) {
+            Some([x, y]) => entry.numbers("at_mm", [*x, *y]),
+            None => entry,
+        };
+        self.out.add("axis", place(Translator::with_rail(entry, &rail, &endstop, start), 0));
+        for (n, section) in (1..).zip(others) {
+            let entry = self.motor(section, &format!("{axis}{n}"))?;
+            let endstop = match section.text("endstop_pin") {
+                Some(_) => self.endstop(section)?,
+                None => Endstop::Other,
+            };
+            let tilt = if places.is_some() { TILT_MM[n % TILT_MM.len()] } else { 0.0 };
+            self.out.add("axis", place(Translator::with_rail(entry, &rail, &endstop, start + tilt), n));
+        }
+        Ok(())
+    }
+
+    /// Where the motors of the z axis hold the bed or the gantry.
+    fn z_places(&self, motors: usize) -> Result<Option<Vec<[f64; 2]>>, Trouble> {
+        let pair = |row: &Vec<f64>| match row[..] {
+            [x, y, ..] => Some([x, y]),
+            _ => None,
+        };
+        for kind in ["z_tilt", "z_tilt_ng"] {
+            if let Some(rows) = self.config.section(kind).map(|section| section.rows("z_positions")).transpose()? {
+                let places: Vec<[f64; 2]> = rows.iter().flatten().filter_map(pair).collect();
+                return Ok((places.len() == motors && motors > 1).then_some(places));
+            }
+        }
+        if let Some(rows) = self.config.section("quad_gantry_level").map(|section| section.rows("gantry_corners")) {
+            let corners: Vec<[f64; 2]> = rows?.iter().flatten().filter_map(pair).collect();
+            if let ([[left, front], [right, rear]], 4) = (&corners[..], motors) {
+                return Ok(Some(vec![[*left, *front], [*left, *rear], [*right, *rear], [*right, *front]]));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The second carriage of a printer with two.
+    fn dual_carriage(&mut self) -> Result<(), Trouble> {
+        let Some(section) = self.config.section("dual_carriage") else { return Ok(()) };
+        let rail = self.travel(section)?;
+        let entry = self.motor(section, "dual_carriage")?;
+        let endstop = self.endstop(section)?;
+        let room = BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0);
+        let start = if rail.at_max { rail.endstop - room } else { rail.endstop + room };
+        let entry = Translator::with_rail(entry, &rail, &endstop, start);
+        let entry = if section.text("axis") == Some("y") { entry.set("along", "y") } else { entry };
+        self.out.add("axis", entry);
+        Ok(())
+    }
+
+    fn generic(&mut self) -> Result<(), Trouble> {
+        self.out.set("kinematics", Entry::default().set("kind", "generic_cartesian"));
+        let carriages = |kind| self.config.of_kind(kind).collect::<Vec<&Section>>();
+        let all: Vec<&Section> = [carriages("carriage"), carriages("dual_carriage")].concat();
+        for section in all {
+            let name = section.own_name().unwrap_or_default();
+            let primary = section.text("primary_carriage").unwrap_or(name);
+            let along = section.text("axis").unwrap_or(primary);
+            let rail = self.travel(section)?;
+            let endstop = self.endstop(section)?;
+            let room = BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0);
+            let start = match (along, rail.at_max) {
+                ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
+                (_, true) => rail.endstop - room,
+                (_, false) => rail.endstop + room,
+            };
+            let entry = Entry::default().set("name", name).set("along", along);
+            self.out.add("carriage", Translator::with_rail(entry, &rail, &endstop, start));
+        }
+        for section in self.config.of_kind("stepper") {
+            let name = section.own_name().unwrap_or_default();
+            let entry = self.motor(section, name)?;
+            let mut carriages = toml::Table::new();
+            // For example `x-y` or `0.5*x`.
+            let terms = section.required("carriages")?.replace('-', "+-").replace(char::is_whitespace, "");
+            for term in terms.split('+').filter(|term| !term.is_empty()) {
+                let (sign, term) = term.strip_prefix('-').map_or((1.0, term), |rest| (-1.0, rest));
+                let (factor, carriage) = match term.split_once('*') {
+                    Some((a, b)) => a.parse().map(|a: f64| (a, b)).or_else(|_| b.parse().map(|b: f64| (b, a))),
+                    None => Ok((1.0, term)),
+                }
+                .map_err(|_| section.trouble("carriages", format!("Invalid term '{term}'")).remedy("correct it"))?;
+                carriages.insert(carriage.to_owned(), (sign * factor).into());
+            }
+            self.out.add("axis", entry.set("carriages", carriages));
+        }
+        Ok(())
+    }
+
+    /// The three sections of a delta printer.
+    fn towers(&self) -> Result<[&'a Section; 3], Trouble> {
+        let config = self.config;
+        let tower = |name: &str| {
+            config.section(&format!("stepper_{name}")).ok_or_else(|| {
+                let cause = format!("Option 'step_pin' in section 'stepper_{name}' must be specified");
+                Trouble::new(cause).remedy(format!("add [stepper_{name}]"))
+            })
+        };
+        Ok([tower("a")?, tower("b")?, tower("c")?])
+    }
+
+    /// An option of three towers. The first one's value is the default of the others.
+    fn of_towers(towers: [&Section; 3], key: &str) -> Result<[f64; 3], Trouble> {
+        towers[0].required(key)?;
+        let first = towers[0].number(key, Limit::Any)?.unwrap_or(0.0);
+        let value = |tower: &Section| tower.number(key, Limit::Any).map(|number| number.unwrap_or(first));
+        Ok([first, value(towers[1])?, value(towers[2])?])
+    }
+
+    fn angles(towers: [&Section; 3], defaults: [f64; 3]) -> Result<[f64; 3], Trouble> {
+        let mut angles = defaults;
+        for (angle, tower) in angles.iter_mut().zip(towers) {
+            *angle = tower.number("angle", Limit::Any)?.unwrap_or(*angle);
+        }
+        Ok(angles)
+    }
+
+    fn delta(&mut self, printer: &Section) -> Result<(), Trouble> {
+        let towers = self.towers()?;
+        printer.required("delta_radius")?;
+        let radius = printer.number("delta_radius", Limit::Above(0.0))?.unwrap_or(1.0);
+        let bed_radius = printer.number("print_radius", Limit::Above(0.0))?.unwrap_or(radius);
+        let arms = Translator::of_towers(towers, "arm_length")?;
+        let endstops = Translator::of_towers(towers, "position_endstop")?;
+        let angles = Translator::angles(towers, [210.0, 330.0, 90.0])?;
+        for (n, (name, section)) in ["a", "b", "c"].into_iter().zip(towers).enumerate() {
+            let highest = endstops[n] + (arms[n] * arms[n] - radius * radius).max(0.0).sqrt();
+            let entry = self.motor(section, name)?;
+            let endstop = self.endstop(section)?;
+            let rail = Rail { min: 0.0, max: highest, endstop: highest, at_max: true };
+            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, highest - BEFORE_ENDSTOP_MM));
+        }
+        let entry = Entry::default()
+            .set("kind", "delta")
+            .set("radius_mm", radius)
+            .set("arm_mm", arms[0])
+            .set("bed_radius_mm", bed_radius);
+        let entry = entry.numbers("arms_mm", arms).numbers("angles_degrees", angles);
+        self.out.set("kinematics", entry);
+        Ok(())
+    }
+
+    fn deltesian(&mut self) -> Result<(), Trouble> {
+        let missing = |name: &str| {
+            let cause = format!("Option 'step_pin' in section '{name}' must be specified");
+            Trouble::new(cause).remedy(format!("add [{name}]"))
+        };
+        let config = self.config;
+        let side = |name: &str| config.section(name).ok_or_else(|| missing(name));
+        let sides = [side("stepper_left")?, side("stepper_right")?];
+        let of = |key: &str| {
+            sides[0].required(key)?;
+            let left = sides[0].number(key, Limit::Any)?.unwrap_or(1.0);
+            Ok::<_, Trouble>([left, sides[1].number(key, Limit::Any)?.unwrap_or(left)])
+        };
+        let (arms, arm_x, endstops) = (of("arm_length")?, of("arm_x_length")?, of("position_endstop")?);
+        for (n, (name, section)) in ["left", "right"].into_iter().zip(sides).enumerate() {
+            let highest = endstops[n] + (arms[n] * arms[n] - arm_x[n] * arm_x[n]).max(0.0).sqrt();
+            let entry = self.motor(section, name)?;
+            let endstop = self.endstop(section)?;
+            let rail = Rail { min: 0.0, max: highest, endstop: highest, at_max: true };
+            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, highest - BEFORE_ENDSTOP_MM));
+        }
+        self.rail("y")?;
+        let entry = Entry::default().set("kind", "deltesian").numbers("arms_mm", arms).numbers("arm_x_mm", arm_x);
+        self.out.set("kinematics", entry);
+        Ok(())
+    }
+
+    fn polar(&mut self) -> Result<(), Trouble> {
+        let config = self.config;
+        let section = |name: &str| {
+            config.section(name).ok_or_else(|| {
+                let cause = format!("Option 'step_pin' in section '{name}' must be specified");
+                Trouble::new(cause).remedy(format!("add [{name}]"))
+            })
+        };
+        let bed = section("stepper_bed")?;
+        let entry = self.motor(bed, "bed")?;
+        self.out.add("axis", entry);
+        let arm = section("stepper_arm")?;
+        let rail = self.travel(arm)?;
+        let entry = self.motor(arm, "arm")?;
+        let endstop = self.endstop(arm)?;
+        let start = if rail.at_max { rail.endstop - BEFORE_ENDSTOP_MM } else { rail.endstop + BEFORE_ENDSTOP_MM };
+        self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, start));
+        self.rail("z")?;
+        self.out.set("kinematics", Entry::default().set("kind", "polar"));
+        Ok(())
+    }
+
+    fn rotary_delta(&mut self, printer: &Section) -> Result<(), Trouble> {
+        let towers = self.towers()?;
+        let number = |key: &str| {
+            printer.required(key)?;
+            printer.number(key, Limit::Above(0.0)).map(|number| number.unwrap_or(1.0))
+        };
+        let (radius, height) = (number("shoulder_radius")?, number("shoulder_height")?);
+        let upper = Translator::of_towers(towers, "upper_arm_length")?;
+        let lower = Translator::of_towers(towers, "lower_arm_length")?;
+        let endstops = Translator::of_towers(towers, "position_endstop")?;
+        let angles = Translator::angles(towers, [30.0, 150.0, 270.0])?;
+        for (n, (name, section)) in ["a", "b", "c"].into_iter().zip(towers).enumerate() {
+            // The arm's angle while the nozzle is in the middle, at the endstop's height. The elbow is at the upper arm's
+            // length from the shoulder, at the lower arm's length from the nozzle, and outside (rotary_delta.py).
+            let (u, l, h) = (upper[n], lower[n], height - endstops[n]);
+            let distance = radius.hypot(h);
+            let share = (l * l - distance * distance - u * u) / (2.0 * u * distance);
+            let angle = h.atan2(radius) - share.clamp(-1.0, 1.0).acos();
+            let entry = self.motor(section, name)?;
+            let endstop = self.endstop(section)?;
+            let rail = Rail { min: angle - 2.0, max: angle, endstop: angle, at_max: true };
+            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, angle - 0.1));
+        }
+        let entry = Entry::default().set("kind", "rotary_delta").set("shoulder_radius_mm", radius);
+        let entry = entry.set("shoulder_height_mm", height).numbers("upper_arms_mm", upper);
+        let entry = entry.numbers("lower_arms_mm", lower).numbers("angles_degrees", angles);
+        self.out.set("kinematics", entry.set("bed_radius_mm", radius));
+        Ok(())
+    }
+
+    fn winch(&mut self) -> Result<(), Trouble> {
+        let config = self.config;
+        let mut anchors = Vec::new();
+        for name in ('a'..='z').map(String::from) {
+            let Some(section) = config.section(&format!("stepper_{name}")) else { break };
+            let mut anchor = [0.0; 3];
+            for (place, key) in anchor.iter_mut().zip(["anchor_x", "anchor_y", "anchor_z"]) {
+                section.required(key)?;
+                *place = section.number(key, Limit::Any)?.unwrap_or(0.0);
+            }
+            let length = anchor.iter().map(|mm| mm * mm).sum::<f64>().sqrt();
+            let entry = self.motor(section, &name)?;
+            self.out.add("axis", entry.set("start_mm", length));
+            anchors.push(anchor);
+        }
+        self.out.set("kinematics", Entry::default().set("kind", "winch").rows("anchors_mm", anchors));
+        Ok(())
+    }
+
+    /// Extruders, and motors that belong to no axis.
+    fn other_motors(&mut self) -> Result<(), Trouble> {
+        for section in self.config.sections() {
+            let kind = section.kind();
+            let is_extruder = kind.strip_prefix("extruder").is_some_and(|n| n.chars().all(|c| c.is_ascii_digit()));
+            if is_extruder || kind == "extruder_stepper" || kind == "manual_stepper" {
+                if is_extruder && section.text("step_pin").is_none() {
+                    continue;
+                }
+                let name = self.out.name("axis", section.own_name().unwrap_or(&section.name));
+                let entry = self.motor(section, &name)?;
+                let entry = match (kind, section.text("endstop_pin")) {
+                    ("manual_stepper", Some(_)) => {
+                        let endstop = self.endstop(section)?;
+                        let rail = Rail { min: -FREE_MM, max: FREE_MM, endstop: 0.0, at_max: false };
+                        Translator::with_rail(entry, &rail, &endstop, BEFORE_ENDSTOP_MM)
+                    }
+                    _ => entry,
+                };
+                self.out.add("axis", entry);
+            }
+        }
+        Ok(())
+    }
+}

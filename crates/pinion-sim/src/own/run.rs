@@ -1,0 +1,121 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim PRINTER.CFG`: its printer, its folder, and what the user does next.
+
+#![forbid(unsafe_code)]
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use pinion_linux::foreign::plain;
+use pinion_printer_config::Trouble;
+use pinion_printer_config::pins::MAIN;
+use toml::Table;
+
+use super::args::OwnArgs;
+use super::serve::{Folder, Own};
+use crate::description::text;
+
+/// Whether a file is klippy's configuration, and no description.
+pub(crate) fn is_printer_cfg(path: &Path) -> bool {
+    path.extension() == Some(OsStr::new("cfg"))
+}
+
+/// Reads a printer.cfg with the options of the command line, and says what a user should know.
+///
+/// # Errors
+///
+/// It is no printer, or has a mistake.
+pub(crate) fn read(path: &Path, args: &OwnArgs) -> Result<Own, Trouble> {
+    let over = args.with.as_deref().map(table).transpose()?;
+    let own = Own::read(path, over, args.pace())?;
+    own.notes.iter().for_each(|note| log::warn!("{note}"));
+    Ok(own)
+}
+
+/// A description that lies over another one.
+fn table(path: &Path) -> Result<Table, Trouble> {
+    let text = text(path)?;
+    text.parse().map_err(|error: toml::de::Error| {
+        let byte = error.span().map_or(0, |span| span.start);
+        Trouble::new(error.message().replace('\n', " ")).remedy("correct it").at(path.display(), &text, byte)
+    })
+}
+
+/// Where klippy finds the MCUs: in a folder with its copy, or where its configuration expects them.
+pub(crate) enum Place {
+    Folder(Folder),
+    InPlace(Vec<PathBuf>),
+}
+
+impl Place {
+    /// Makes the folder, or checks the paths. `link` is the command line's path of the main MCU.
+    ///
+    /// # Errors
+    ///
+    /// The folder cannot be made, or a path is no place for a link.
+    pub(crate) fn make(own: &Own, args: &OwnArgs, link: Option<&Path>) -> Result<Place, Trouble> {
+        if args.in_place_pty {
+            return own.mcus.iter().map(|mcu| in_place(own, mcu)).collect::<Result<_, _>>().map(Place::InPlace);
+        }
+        let place = |folder: &Path, mcu: &str| match (mcu, link) {
+            (MAIN, Some(link)) => link.to_owned(),
+            (MAIN, None) => folder.join(MAIN),
+            (mcu, Some(link)) => beside(link, mcu),
+            (mcu, None) => beside(&folder.join(MAIN), mcu),
+        };
+        Folder::make(own, args.folder.as_deref(), place).map(Place::Folder)
+    }
+
+    /// The links of all MCUs, the main one's first.
+    pub(crate) fn links(&self, own: &Own, link: Option<&Path>) -> Vec<PathBuf> {
+        match self {
+            Place::InPlace(links) => links.clone(),
+            Place::Folder(folder) => {
+                let main = link.map_or_else(|| folder.path.join(MAIN), Path::to_owned);
+                let of = |mcu: &String| if mcu == MAIN { main.clone() } else { beside(&main, mcu) };
+                own.mcus.iter().map(of).collect()
+            }
+        }
+    }
+
+    /// What the user does next.
+    pub(crate) fn next(&self, args: &OwnArgs) -> Vec<String> {
+        match self {
+            Place::Folder(folder) => vec![
+                format!("The printer waits for klippy. Its copy of printer.cfg is {}:", folder.printer_cfg.display()),
+                format!("  {}", folder.command(args.klipper())),
+            ],
+            Place::InPlace(links) => {
+                let links: Vec<String> = links.iter().map(|link| link.display().to_string()).collect();
+                vec![format!("The printer waits for klippy at {}.", plain(&links.join(" and ")))]
+            }
+        }
+    }
+}
+
+/// The link of another MCU, beside the main one's.
+fn beside(main: &Path, mcu: &str) -> PathBuf {
+    let mut name = main.as_os_str().to_owned();
+    name.push("_");
+    name.push(mcu);
+    name.into()
+}
+
+/// The path where klippy expects an MCU.
+fn in_place(own: &Own, mcu: &str) -> Result<PathBuf, Trouble> {
+    let name = if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") };
+    let section = own.config.section(&name).ok_or_else(|| Trouble::new(format!("there is no [{name}]")))?;
+    let path = PathBuf::from(section.required("serial")?);
+    let refused = |cause: &str| {
+        let remedy = "leave --in-place-pty out, or set `serial` to a path in /tmp";
+        Err(section.trouble("serial", format!("{}: {cause}", path.display())).remedy(remedy))
+    };
+    if !path.is_absolute() || path.starts_with("/dev") || path.starts_with("/sys") || path.starts_with("/proc") {
+        return refused("it is no place for a link");
+    }
+    match fs::symlink_metadata(&path) {
+        Ok(about) if !about.is_symlink() => refused("something else is there"),
+        _ => Ok(path),
+    }
+}

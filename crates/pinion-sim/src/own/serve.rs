@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A printer.cfg as it is served: read, translated, and copied to a folder of its own for klippy.
+//!
+//! The user's files are never changed. The copy differs in the way to each MCU and in the places where klippy writes.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use pinion_linux::foreign::{self, word};
+use pinion_printer_config::copy::{self, Change};
+use pinion_printer_config::{Config, Trouble};
+use pinion_sim::SimConfig;
+use toml::{Table, Value};
+
+use super::translate::{Pace, Translated, translate};
+
+/// The ways to an MCU in its section.
+const WAYS: [&str; 5] = ["serial", "canbus_uuid", "canbus_interface", "baud", "restart_method"];
+/// Longest file of saved variables.
+const VARIABLES_MAX: u64 = 1 << 20;
+
+/// Somebody's printer.
+pub(crate) struct Own {
+    pub(crate) config: Config,
+    pub(crate) sim: SimConfig,
+    /// The description in TOML.
+    pub(crate) description: String,
+    /// The MCUs, the main one first.
+    pub(crate) mcus: Vec<String>,
+    pub(crate) notes: Vec<Trouble>,
+}
+
+impl Own {
+    /// Reads a printer.cfg. `over` is a description that lies over the one that comes out of it.
+    ///
+    /// # Errors
+    ///
+    /// It is no printer, or has a mistake.
+    pub(crate) fn read(path: &Path, over: Option<Table>, pace: Pace) -> Result<Own, Trouble> {
+        let mut config = Config::read(path)?;
+        config.put_constants_in();
+        let Translated { mut description, mcus, notes } = translate(&config, pace)?;
+        if let Some(over) = over {
+            lay_over(&mut description, over);
+        }
+        let name = path.display();
+        let description = toml::to_string(&description).map_err(|error| Trouble::new(error.to_string()).of(&name))?;
+        let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
+        Ok(Own { config, sim, description, mcus, notes })
+    }
+}
+
+/// Puts a description over another one. An entry with the name of another one changes its keys. All others are added.
+fn lay_over(under: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (under.get_mut(&key), value) {
+            (Some(Value::Table(under)), Value::Table(over)) => lay_over(under, over),
+            (Some(Value::Array(under)), Value::Array(over)) if over.iter().all(Value::is_table) => {
+                for entry in over {
+                    let its = |key: &str| entry.get(key).cloned();
+                    let keys = ["kind", "name", "axis"].map(|key| (key, its(key)));
+                    let known = under.iter_mut().find(|other| {
+                        keys.iter().any(|(key, _)| *key != "kind" && its(key).is_some())
+                            && keys.iter().all(|(key, value)| other.get(key) == value.as_ref())
+                    });
+                    match (known, entry) {
+                        (Some(Value::Table(known)), Value::Table(entry)) => known.extend(entry),
+                        (_, entry) => under.push(entry),
+                    }
+                }
+            }
+            (_, value) => _ = under.insert(key, value),
+        }
+    }
+}
+
+/// The folder for a klippy.
+pub(crate) struct Folder {
+    pub(crate) path: PathBuf,
+    /// The copy of printer.cfg.
+    pub(crate) printer_cfg: PathBuf,
+}
+
+impl Folder {
+    /// Makes the folder and the copy. `link` is the way to an MCU.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be written, or has files of somebody else.
+    pub(crate) fn make(
+        own: &Own,
+        named: Option<&Path>,
+        link: impl Fn(&Path, &str) -> PathBuf,
+    ) -> Result<Folder, Trouble> {
+        let path = match named {
+            Some(named) => new_or_ours(named)?,
+            None => nix::unistd::mkdtemp("/tmp/pinion-sim-XXXXXX").map_err(|error| {
+                Trouble::new(format!("no folder can be made in /tmp: {error}")).remedy("free space")
+            })?,
+        };
+        let gcodes = path.join("gcodes");
+        let failed = |path: &Path, error: std::io::Error| {
+            Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("name another folder")
+        };
+        fs::create_dir_all(&gcodes).map_err(|error| failed(&gcodes, error))?;
+        fs::write(path.join(MARK), "").map_err(|error| failed(&path, error))?;
+        let mut changes = Vec::new();
+        for mcu in &own.mcus {
+            let section = if mcu == pinion_printer_config::pins::MAIN { mcu.clone() } else { format!("mcu {mcu}") };
+            let serial = link(&path, mcu).display().to_string();
+            changes.push(Change {
+                section,
+                without: WAYS.map(str::to_owned).to_vec(),
+                with: vec![("serial".into(), serial), ("restart_method".into(), "command".into())],
+            });
+        }
+        let elsewhere = |section: &str, key: &str, value: &Path| Change {
+            section: section.into(),
+            without: vec![key.into()],
+            with: vec![(key.into(), value.display().to_string())],
+        };
+        changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        if let Some(section) = own.config.section("save_variables") {
+            let variables = path.join("variables.cfg");
+            let file = section.text("filename").map(at_home);
+            if let Some(Ok(bytes)) = file.map(|file| foreign::read(&file, VARIABLES_MAX)) {
+                fs::write(&variables, bytes).map_err(|error| failed(&variables, error))?;
+            }
+            changes.push(elsewhere("save_variables", "filename", &variables));
+        }
+        let printer_cfg = copy::write(&own.config, &changes, &path)?;
+        Ok(Folder { path, printer_cfg })
+    }
+
+    /// The command that starts klippy on the copy.
+    pub(crate) fn command(&self, klipper: Option<&Path>) -> String {
+        let klipper = klipper.map_or_else(|| "~/klipper".to_owned(), |path| word(path.display()));
+        let [cfg, log, socket] =
+            [self.printer_cfg.clone(), self.path.join("klippy.log"), self.path.join("klippy.sock")]
+                .map(|path| word(path.display()));
+        format!("python3 {klipper}/klippy/klippy.py {cfg} -l {log} -a {socket}")
+    }
+}
+
+/// A file in a folder that this program made.
+const MARK: &str = ".pinion-sim";
+
+/// A folder that is new, empty, or made by an earlier run.
+fn new_or_ours(path: &Path) -> Result<PathBuf, Trouble> {
+    let refused = |cause: String| Trouble::new(cause).of(path.display()).remedy("name a new folder");
+    fs::create_dir_all(path).map_err(|error| refused(format!("it cannot be made: {error}")))?;
+    let path = fs::canonicalize(path).map_err(|error| refused(error.to_string()))?;
+    let mut names = fs::read_dir(&path).map_err(|error| refused(error.to_string()))?;
+    if names.next().is_some() && !path.join(MARK).exists() {
+        return Err(refused("it has files of somebody else".into()));
+    }
+    Ok(path)
+}
+
+/// A path whose `~` is the home folder.
+fn at_home(path: &str) -> PathBuf {
+    match (path.strip_prefix("~/"), std::env::var_os("HOME")) {
+        (Some(rest), Some(home)) => Path::new(&home).join(rest),
+        _ => path.into(),
+    }
+}

@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A copy of a configuration in a folder of its own, in which chosen options differ.
+//!
+//! A file keeps its place relative to the main one, so the includes stay as they are. Files that are not below the main
+//! one's folder get a place in [`OUTSIDE`], and the line that includes them names it.
+
+#![forbid(unsafe_code)]
+
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::files::normal;
+use crate::{Config, Trouble};
+
+/// The folder for files that are not below the main one's folder.
+const OUTSIDE: &str = "outside";
+
+/// Options of a section that the copy has in place of others.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Change {
+    /// The whole name of the section.
+    pub section: String,
+    /// The options that go.
+    pub without: Vec<String>,
+    /// The options that come.
+    pub with: Vec<(String, String)>,
+}
+
+/// Writes the copy. Returns the path of its main file.
+///
+/// # Errors
+///
+/// A file cannot be written.
+pub fn write(config: &Config, changes: &[Change], folder: &Path) -> Result<PathBuf, Trouble> {
+    let main = config.files.first().map_or_else(|| Path::new("printer.cfg").into(), |file| file.path.clone());
+    let home = normal(main.parent().unwrap_or(Path::new("")));
+    let mut places: HashMap<Arc<Path>, PathBuf> = HashMap::new();
+    for (number, file) in config.files.iter().enumerate() {
+        let name = file.path.file_name().unwrap_or_default();
+        let below = normal(&file.path).strip_prefix(&home).ok().map(Path::to_owned);
+        let below = below.filter(|path| path.is_relative() && !path.starts_with(".."));
+        let place = below.unwrap_or_else(|| Path::new(OUTSIDE).join(number.to_string()).join(name));
+        places.insert(file.path.clone(), place);
+    }
+    let mut opened = HashSet::new();
+    for file in &config.files {
+        let text = changed(config, changes, &file.path, &places, &mut opened, &file.text);
+        let path = folder.join(&places[&file.path]);
+        let written = path.parent().map_or(Ok(()), fs::create_dir_all).and_then(|()| fs::write(&path, text));
+        written.map_err(|error| {
+            let trouble = Trouble::new(format!("the copy cannot be written: {error}"));
+            trouble.of(path.display()).remedy("free space, or name another folder")
+        })?;
+    }
+    Ok(folder.join(&places[&main]))
+}
+
+/// The text of a file in the copy. `opened` has the sections with options that came already.
+fn changed(
+    config: &Config,
+    changes: &[Change],
+    path: &Arc<Path>,
+    places: &HashMap<Arc<Path>, PathBuf>,
+    opened: &mut HashSet<String>,
+    text: &str,
+) -> String {
+    let mut lines: Vec<String> = text.split('\n').map(str::to_owned).collect();
+    let change_of = |section: &str| changes.iter().find(|change| change.section == section);
+    for entry in config.entries.iter().filter(|entry| entry.file == *path) {
+        if !change_of(&entry.section).is_some_and(|change| change.without.contains(&entry.key)) {
+            continue;
+        }
+        for number in entry.lines.clone() {
+            if let Some(line) = lines.get_mut(number - 1).filter(|line| !line.starts_with("# ")) {
+                line.insert_str(0, "# ");
+            }
+        }
+    }
+    for include in config.includes.iter().filter(|include| include.place.file == *path) {
+        let is_outside = |file: &Arc<Path>| places.get(file).is_some_and(|place| place.starts_with(OUTSIDE));
+        let inside = places.get(path).is_some_and(|place| !place.starts_with(OUTSIDE));
+        if inside && !include.found.iter().any(is_outside) {
+            continue;
+        }
+        // The path from this file's place in the copy to the others.
+        let depth = places.get(path).and_then(|place| place.parent()).map_or(0, |parent| parent.components().count());
+        let up: PathBuf = std::iter::repeat_n("..", depth).collect();
+        let named = include.found.iter().filter_map(|file| places.get(file));
+        let named: Vec<String> = named.map(|place| format!("[include {}]", up.join(place).display())).collect();
+        if let Some(line) = lines.get_mut(include.place.line - 1) {
+            *line = named.join("\n");
+        }
+    }
+    for (name, place) in config.headers.iter().filter(|(_, place)| place.file == *path) {
+        let Some(change) = change_of(name).filter(|_| opened.insert(name.clone())) else { continue };
+        if let Some(line) = lines.get_mut(place.line - 1) {
+            for (key, value) in &change.with {
+                line.push_str(&format!("\n{key}: {value}"));
+            }
+        }
+    }
+    lines.join("\n")
+}

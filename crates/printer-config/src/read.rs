@@ -1,0 +1,158 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A configuration from its files: includes and the SAVE_CONFIG block.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::files::{Disk, Files, is_pattern};
+use crate::parse::{Line, header, uncommented};
+use crate::{Config, Include, Place, SourceFile, Trouble};
+
+/// Highest number of files, each counted as often as it is included.
+const FILES_MAX: usize = 500;
+/// Highest number of bytes in all files.
+const BYTES_MAX: usize = 16 << 20;
+/// The head of the block that klippy's SAVE_CONFIG writes.
+const SAVED: &str = "\n#*# <---------------------- SAVE_CONFIG ---------------------->\n\
+                     #*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.\n#*#\n";
+
+impl Config {
+    /// Reads a printer.cfg with all files that it includes.
+    ///
+    /// # Errors
+    ///
+    /// The first thing that klippy would refuse, or that is beyond a limit.
+    pub fn read(path: &Path) -> Result<Config, Trouble> {
+        Config::read_from(&Disk, path)
+    }
+
+    /// The same, with files from somewhere.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Config::read`].
+    pub fn read_from(files: &dyn Files, path: &Path) -> Result<Config, Trouble> {
+        let mut reader = Reader { files, config: Config::default(), within: Vec::new(), opened: 0, bytes: 0 };
+        let text = reader.text(path)?;
+        let (usual, saved) = match text.find(SAVED).map(|at| text.split_at(at)) {
+            Some((usual, block)) => match saved_lines(block) {
+                Some(lines) if !usual.contains("\n#*# ") => (usual, lines),
+                // klippy ignores a block that somebody edited.
+                _ => (text.as_str(), Vec::new()),
+            },
+            None => (text.as_str(), Vec::new()),
+        };
+        let file: Arc<Path> = path.into();
+        reader.include(&file, usual)?;
+        let mut config = reader.config;
+        config.add_saved(&file, usual.matches('\n').count(), &saved)?;
+        config.files.insert(0, SourceFile { path: file, text });
+        Ok(config)
+    }
+
+    /// Adds the options of the SAVE_CONFIG block that the files do not set. klippy comments the others out.
+    fn add_saved(&mut self, file: &Arc<Path>, before: usize, lines: &[&str]) -> Result<(), Trouble> {
+        let mut section = String::new();
+        let mut is_set = false;
+        let mut kept = Vec::new();
+        for (number, text) in (before + 2..).zip(lines) {
+            let pruned = text.find(['#', ';']).map_or(*text, |at| &text[..at]).trim_end();
+            if let Some(first) = pruned.chars().next().filter(|first| !first.is_whitespace()) {
+                is_set = false;
+                if first == '[' {
+                    section = pruned[1..].trim_end_matches(']').trim().to_owned();
+                } else {
+                    let word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+                    let key = pruned.split(|c| !word(c)).next().unwrap_or_default().to_lowercase();
+                    is_set = self.section(&section).is_some_and(|section| section.setting(&key).is_some());
+                }
+            }
+            kept.push(Line { number, text: if is_set { "" } else { uncommented(text) } });
+        }
+        self.add(file, &kept)
+    }
+}
+
+/// The lines of a SAVE_CONFIG block without their mark; `None` if a line has none.
+fn saved_lines(block: &str) -> Option<Vec<&str>> {
+    let strip = |line: &'_ str| -> Option<usize> {
+        (line.starts_with("#*#") && (line.len() < 4 || line.starts_with("#*# "))).then(|| line.len().min(4))
+    };
+    block[1..].trim_end().lines().map(|line| strip(line).map(|mark| &line[mark..])).collect()
+}
+
+struct Reader<'a> {
+    files: &'a dyn Files,
+    config: Config,
+    /// The files that are being read: each includes the next one.
+    within: Vec<PathBuf>,
+    opened: usize,
+    bytes: usize,
+}
+
+impl Reader<'_> {
+    fn text(&mut self, path: &Path) -> Result<String, Trouble> {
+        let refused = |cause: String, remedy: &str| Trouble::new(cause).of(path.display()).remedy(remedy);
+        self.opened += 1;
+        if self.opened > FILES_MAX {
+            return Err(refused(format!("more than {FILES_MAX} files are included"), "include fewer"));
+        }
+        let text = self
+            .files
+            .text(path)
+            .map_err(|error| refused(format!("Unable to open config file: {error}"), "name a readable printer.cfg"))?;
+        self.bytes += text.len();
+        if self.bytes > BYTES_MAX {
+            return Err(refused(format!("the files have more than {} MiB", BYTES_MAX >> 20), "include fewer"));
+        }
+        Ok(text.replace("\r\n", "\n").replace('\r', "\n"))
+    }
+
+    /// Reads a text and what it includes.
+    fn include(&mut self, file: &Arc<Path>, text: &str) -> Result<(), Trouble> {
+        let whole = self.files.whole(file);
+        if self.within.contains(&whole) {
+            return Err(format!("Recursive include of config file '{}'", file.display()).into());
+        }
+        self.within.push(whole);
+        let mut lines = Vec::new();
+        for (number, text) in (1..).zip(text.split('\n')) {
+            let text = uncommented(text);
+            let Some(pattern) = header(text).and_then(|name| name.strip_prefix("include ")) else {
+                lines.push(Line { number, text });
+                continue;
+            };
+            self.config.add(file, &lines)?;
+            lines.clear();
+            let place = Place { file: file.clone(), line: number };
+            self.matching(&place, pattern.trim()).map_err(|trouble| trouble.of(&place))?;
+        }
+        self.config.add(file, &lines)?;
+        self.within.pop();
+        Ok(())
+    }
+
+    /// Reads the files of an include.
+    fn matching(&mut self, place: &Place, pattern: &str) -> Result<(), Trouble> {
+        let pattern = place.file.parent().unwrap_or(Path::new("")).join(pattern);
+        let found = self.files.matching(&pattern).map_err(|error| {
+            Trouble::new(format!("Include file '{}': {error}", pattern.display())).remedy("name fewer files")
+        })?;
+        if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) {
+            let cause = format!("Include file '{}' does not exist", pattern.display());
+            return Err(Trouble::new(cause).remedy("correct its name, or remove the line"));
+        }
+        let found: Vec<Arc<Path>> = found.into_iter().map(Into::into).collect();
+        self.config.includes.push(Include { place: place.clone(), found: found.clone() });
+        for path in found {
+            let text = self.text(&path)?;
+            if !self.config.files.iter().any(|file| file.path == path) {
+                self.config.files.push(SourceFile { path: path.clone(), text: text.clone() });
+            }
+            self.include(&path, &text)?;
+        }
+        Ok(())
+    }
+}

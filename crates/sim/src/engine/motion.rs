@@ -1,0 +1,305 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Everything that the pins move: motors, and the rails that they move.
+//!
+//! The core of a board drives the pins of its motors. Any thread may read. Nothing here locks, blocks or allocates.
+//!
+//! A rail is what has an endstop and two ends: the carriage of an axis, the tower of a delta, an arm that turns. Most
+//! motors move one rail. On CoreXY each of two motors moves two of them. A rail keeps no place of its own: its place
+//! follows from its motors, so that motors of several boards may move it.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+
+use super::seqlock::Seqlock;
+use super::track::Track;
+use crate::description::axes::{AxisConfig, End};
+use crate::description::rails::RailConfig;
+use pinion_firmware::time::Clock;
+
+/// Places are compared in these units: a picometer, or as small a part of a radian. Sums of fractions would miss the
+/// place of an endstop by their rounding.
+const PER_MM: f64 = 1e9;
+
+/// How far two motors of one rail may be apart. The rail then jams, and a motor that goes on loses its steps. Homing
+/// stops motors of two boards up to 25 ms apart.
+const RACKED_MM: f64 = 3.0;
+
+/// The rotor of a motor, and its last steps.
+#[derive(Debug)]
+pub struct Motor {
+    position: AtomicI64,
+    track: Track,
+}
+
+impl Motor {
+    /// The limits of the description keep the position below 2^63.
+    pub fn at(start_mm: f64, config: &AxisConfig) -> Arc<Motor> {
+        let position = AtomicI64::new((start_mm * config.steps_per_mm).round() as i64);
+        Arc::new(Motor { position, track: Track::new() })
+    }
+
+    /// Its place in steps.
+    pub fn steps(&self) -> i64 {
+        self.position.load(Ordering::Relaxed)
+    }
+
+    /// Its last steps with their instants.
+    pub fn track(&self) -> &Track {
+        &self.track
+    }
+}
+
+/// What motors move between two ends.
+#[derive(Debug)]
+pub struct Rail {
+    pub name: String,
+    /// Its lowest and its highest place, in mm or radians; `None` for a rail without an end.
+    pub travel_mm: Option<(f64, f64)>,
+    /// Its motors, each with the way of the rail in one of its steps.
+    motors: Vec<(Arc<Motor>, f64)>,
+    /// The lowest and the highest place that it reaches without hitting something.
+    hard_limits: Option<(i64, i64)>,
+    /// The endstop's end, and the place where it closes.
+    endstop: Option<(End, i64)>,
+}
+
+impl Rail {
+    pub fn new(config: &RailConfig, motors: Vec<(Arc<Motor>, f64)>) -> Rail {
+        let travel_mm = config.travel_mm;
+        Rail {
+            name: config.name.to_owned(),
+            travel_mm,
+            motors,
+            hard_limits: travel_mm.map(|(min_mm, max_mm)| {
+                let over_mm = config.overtravel_mm;
+                (units(min_mm - over_mm), units(max_mm + over_mm))
+            }),
+            endstop: config.endstop.map(|(end, mm)| (end, units(mm))),
+        }
+    }
+
+    /// Its motors, each with the way of the rail in one of its steps.
+    pub(crate) fn motors(&self) -> &[(Arc<Motor>, f64)] {
+        &self.motors
+    }
+
+    fn units(&self) -> i64 {
+        self.units_at(Motor::steps)
+    }
+
+    fn units_at(&self, steps: impl Fn(&Motor) -> i64) -> i64 {
+        units(self.motors.iter().map(|(motor, mm)| steps(motor) as f64 * mm).sum())
+    }
+
+    /// Its place while its motors are at these steps.
+    pub fn mm_at(&self, steps: impl Fn(&Motor) -> i64) -> f64 {
+        self.units_at(steps) as f64 / PER_MM
+    }
+
+    /// Its place.
+    pub fn position_mm(&self) -> f64 {
+        self.mm_at(Motor::steps)
+    }
+
+    /// The greatest way of a step.
+    pub fn step_mm(&self) -> f64 {
+        self.motors.iter().map(|(_, mm)| mm.abs()).fold(0.0, f64::max)
+    }
+
+    /// Whether the rail can move by this way. A rail beyond its end can come back.
+    fn moves_by(&self, mm: f64) -> bool {
+        let to = self.units() + units(mm);
+        self.hard_limits.is_none_or(|(min, max)| if mm < 0.0 { to >= min } else { to <= max })
+    }
+
+    /// Whether the endstop is closed; `None` without an endstop.
+    pub fn endstop(&self) -> Option<bool> {
+        let position = self.units();
+        self.endstop.map(|(end, at)| match end {
+            End::Min => position <= at,
+            End::Max => position >= at,
+        })
+    }
+}
+
+/// The limits of the description keep it below 2^63.
+fn units(mm: f64) -> i64 {
+    (mm * PER_MM).round() as i64
+}
+
+/// A stepper motor with its driver, and the rail of its name.
+#[derive(Debug)]
+pub struct Axis {
+    pub name: String,
+    steps_per_mm: f64,
+    rail: Arc<Rail>,
+    /// What its motor moves, and the way of one step forward.
+    moves: Vec<(Arc<Rail>, f64)>,
+    /// The first motor of the rail that this one moves too, and the way of its step.
+    beside: Option<(Arc<Motor>, f64)>,
+    /// Whether a falling edge is also a step.
+    both_edges: AtomicBool,
+    /// Whether the step line is on.
+    stepped: AtomicBool,
+    /// Whether the direction line is low for forward.
+    dir_inverted: bool,
+    forward: AtomicBool,
+    enabled: AtomicBool,
+    motor: Arc<Motor>,
+    /// Steps that its driver received: those with a low direction line minus those with a high one.
+    turned: AtomicI64,
+    lost_steps: AtomicU64,
+    /// The instant of the last step, the ticks between it and the step before, and the number of lost steps in a row
+    /// until then.
+    stride: Seqlock<3>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stride {
+    /// Ticks between two steps.
+    pub ticks: u64,
+    /// Steps in a row that the motor could not make.
+    pub lost_in_a_row: u64,
+}
+
+impl Axis {
+    /// A motor with a rail of its own.
+    #[cfg(test)]
+    pub fn new(config: &AxisConfig) -> Axis {
+        let motor = Motor::at(config.start_mm, config);
+        let step_mm = 1.0 / config.steps_per_mm;
+        let rail = Arc::new(Rail::new(&RailConfig::of(config), vec![(motor.clone(), step_mm)]));
+        Axis::driving(config, motor, rail.clone(), vec![(rail, step_mm)])
+    }
+
+    /// A motor that moves these rails, each by this way in a step.
+    pub fn driving(config: &AxisConfig, motor: Arc<Motor>, rail: Arc<Rail>, moves: Vec<(Arc<Rail>, f64)>) -> Axis {
+        Axis {
+            name: config.name.clone(),
+            steps_per_mm: config.steps_per_mm,
+            rail,
+            moves,
+            beside: None,
+            both_edges: AtomicBool::new(config.step_both_edges),
+            stepped: AtomicBool::new(false),
+            dir_inverted: config.dir_pin.inverted,
+            forward: AtomicBool::new(false),
+            enabled: AtomicBool::new(config.enable_pin.is_none()),
+            motor,
+            turned: AtomicI64::new(0),
+            lost_steps: AtomicU64::new(0),
+            stride: Seqlock::new([0, u64::MAX, 0]),
+        }
+    }
+
+    /// The same motor, fixed to a rail that `first` moves.
+    pub fn beside(self, first: &Axis) -> Axis {
+        Axis { beside: Some((first.motor.clone(), first.step_mm())), ..self }
+    }
+
+    pub fn set_both_edges(&self, both_edges: bool) {
+        self.both_edges.store(both_edges, Ordering::Relaxed);
+    }
+
+    pub fn set_forward(&self, forward: bool) {
+        self.forward.store(forward, Ordering::Relaxed);
+    }
+
+    pub fn set_enabled(&self, enabled: bool) {
+        self.enabled.store(enabled, Ordering::Relaxed);
+    }
+
+    pub fn is_enabled(&self) -> bool {
+        self.enabled.load(Ordering::Relaxed)
+    }
+
+    /// Whether the level of the direction line is high.
+    pub fn is_dir_high(&self) -> bool {
+        self.forward.load(Ordering::Relaxed) != self.dir_inverted
+    }
+
+    pub fn is_stepped(&self) -> bool {
+        self.stepped.load(Ordering::Relaxed)
+    }
+
+    /// An edge of the step line.
+    pub fn edge(&self, on: bool, at: Clock) {
+        self.stepped.store(on, Ordering::Relaxed);
+        if on || self.both_edges.load(Ordering::Relaxed) {
+            let [last, _, lost_in_a_row] = self.stride.load();
+            let ticks = if last == 0 { u64::MAX } else { at.since(Clock::from_ticks(last)).max(0) as u64 };
+            let lost_in_a_row = if self.step(at) { 0 } else { lost_in_a_row + 1 };
+            self.stride.store([at.ticks(), ticks, lost_in_a_row]);
+        }
+    }
+
+    /// One step. False if the motor could not make it, because its axis had hit something.
+    fn step(&self, at: Clock) -> bool {
+        let turn = if self.is_dir_high() { -1 } else { 1 };
+        self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
+        if !self.is_enabled() {
+            return true;
+        }
+        let way = if self.forward.load(Ordering::Relaxed) { 1 } else { -1 };
+        let moves = |(rail, step_mm): &(Arc<Rail>, f64)| rail.moves_by(way as f64 * step_mm);
+        if self.racks(way) || !self.moves.iter().all(moves) {
+            let lost = self.lost_steps.load(Ordering::Relaxed);
+            self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
+            return false;
+        }
+        let position = self.motor.steps().wrapping_add(way);
+        self.motor.position.store(position, Ordering::Relaxed);
+        self.motor.track.push(at, position);
+        true
+    }
+
+    /// Whether a step would take it too far from the first motor of its rail.
+    fn racks(&self, way: i64) -> bool {
+        self.beside.as_ref().is_some_and(|(first, its_mm)| {
+            let apart_mm = self.mm(self.motor.steps()) - first.steps() as f64 * its_mm;
+            apart_mm.abs() > RACKED_MM && apart_mm * way as f64 > 0.0
+        })
+    }
+
+    /// The stride at this instant. The time to the next step is unknown, but at least the time since the last step.
+    pub fn stride(&self, now: Clock) -> Stride {
+        let [last, ticks, lost_in_a_row] = self.stride.load();
+        let since = now.since(Clock::from_ticks(last)).max(0) as u64;
+        Stride { ticks: ticks.max(since), lost_in_a_row }
+    }
+
+    /// The rail of its name.
+    pub fn rail(&self) -> &Arc<Rail> {
+        &self.rail
+    }
+
+    /// The position of its motor.
+    pub fn position_steps(&self) -> i64 {
+        self.motor.steps()
+    }
+
+    pub fn turned_steps(&self) -> i64 {
+        self.turned.load(Ordering::Relaxed)
+    }
+
+    /// The way of the motor in this number of steps, in mm.
+    pub fn mm(&self, steps: i64) -> f64 {
+        steps as f64 / self.steps_per_mm
+    }
+
+    /// The way of one step.
+    pub fn step_mm(&self) -> f64 {
+        1.0 / self.steps_per_mm
+    }
+
+    #[cfg(test)]
+    pub fn position_mm(&self) -> f64 {
+        self.rail.position_mm()
+    }
+
+    pub fn lost_steps(&self) -> u64 {
+        self.lost_steps.load(Ordering::Relaxed)
+    }
+}

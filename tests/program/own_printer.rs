@@ -1,0 +1,140 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim printer.cfg`: the copy for klippy, the board that is served, mistakes and exit statuses.
+
+use std::fs;
+
+use crate::process::{Pinion, folder_with};
+
+/// Runs `pinion` to its end: its exit code, its output and its log.
+fn output(args: &[&str]) -> (Option<i32>, String, String) {
+    let done = crate::process::output(args);
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (done.status, text(&done.stdout), text(&done.stderr))
+}
+
+/// A printer of two MCUs.
+const PRINTER: &str = "\
+[mcu]
+serial: /dev/serial/by-id/usb-a
+baud: 250000
+[mcu tool]
+canbus_uuid: 0123456789ab
+[printer]
+kinematics: cartesian
+max_velocity: 300
+max_accel: 3000
+[stepper_x]
+step_pin: PB9
+dir_pin: !PC2
+enable_pin: !PC3
+microsteps: 16
+rotation_distance: 40
+endstop_pin: ^tool:gpio5
+position_endstop: 0
+position_max: 235
+[stepper_y]
+step_pin: PB8
+dir_pin: PB7
+enable_pin: !PC3
+microsteps: 16
+rotation_distance: 40
+endstop_pin: ^PA6
+position_endstop: 0
+position_max: 235
+[stepper_z]
+step_pin: PB6
+dir_pin: !PB5
+enable_pin: !PC3
+microsteps: 16
+rotation_distance: 8
+endstop_pin: ^PA7
+position_endstop: 0
+position_max: 250
+[virtual_sdcard]
+path: ~/printer_data/gcodes
+";
+
+#[test]
+fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
+    let (home, cfg) = folder_with("printer.cfg", PRINTER);
+    let folder = home.path().join("sim");
+    let mut pinion = Pinion::start_in(
+        tempfile::tempdir().unwrap(),
+        &["sim", cfg.to_str().unwrap(), "--folder", folder.to_str().unwrap()],
+    );
+    pinion.wait_for_link();
+    let copy = fs::read_to_string(folder.join("printer.cfg")).unwrap();
+    let link = pinion.link().display().to_string();
+    assert!(copy.contains(&format!("[mcu]\nserial: {link}\nrestart_method: command\n# serial: /dev/serial")), "{copy}");
+    assert!(copy.contains(&format!("[mcu tool]\nserial: {link}_tool\n")), "{copy}");
+    assert!(copy.contains("# baud: 250000") && copy.contains("# canbus_uuid: 0123456789ab"), "{copy}");
+    assert!(
+        copy.contains(&format!("path: {}\n", fs::canonicalize(folder.join("gcodes")).unwrap().display())),
+        "{copy}"
+    );
+    assert_eq!(fs::read_to_string(&cfg).unwrap(), PRINTER, "the original");
+    let client = pinion.client();
+    let pins = format!("{:?}", client.dictionary());
+    for pin in ["PB9", "PC2", "PA6"] {
+        assert!(pins.contains(&format!("\"{pin}\"")), "{pin} is missing");
+    }
+    assert!(!pins.contains("gpio5"), "it is a pin of the other MCU");
+    drop(client);
+    pinion.signal(nix::sys::signal::Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    assert!(pinion.out().contains("klippy/klippy.py"), "{}", pinion.out());
+}
+
+#[test]
+fn a_mistake_is_one_line_with_its_place() {
+    for (from, to, part) in [
+        (
+            "position_max: 235\n",
+            "",
+            "printer.cfg:10: Option 'position_max' in section 'stepper_x' must be specified: add it",
+        ),
+        (
+            "rotation_distance: 40",
+            "rotation_distance: -4",
+            "printer.cfg:15: Option 'rotation_distance' in section 'stepper_x' must be above 0.0",
+        ),
+        ("[printer]", "printer", "printer.cfg:6: Source contains parsing errors: 'printer'"),
+        ("[printer]", "[include printer.cfg]\n[printer]", "Recursive include of config file"),
+    ] {
+        let (_home, cfg) = folder_with("printer.cfg", &PRINTER.replacen(from, to, 1));
+        let (status, out, log) = output(&["sim", cfg.to_str().unwrap()]);
+        assert_eq!((status, out.as_str()), (Some(1), ""), "{log}");
+        assert!(log.contains(part), "{log}");
+    }
+}
+
+#[test]
+fn the_description_of_a_printer_cfg_is_a_description() {
+    let (home, cfg) = folder_with("printer.cfg", PRINTER);
+    let (status, printed, log) = output(&["sim", cfg.to_str().unwrap(), "--print-board"]);
+    assert_eq!(status, Some(0), "{log}");
+    let board = home.path().join("board.toml");
+    fs::write(&board, &printed).unwrap();
+    let (status, again, log) = output(&["sim", board.to_str().unwrap(), "--print-config"]);
+    assert_eq!(status, Some(0), "{log}");
+    assert!(again.contains("[stepper_x]") && again.contains("tool:gpio5"), "{again}");
+    let over = home.path().join("over.toml");
+    fs::write(&over, "[[axis]]\nname = \"x\"\nstart_mm = 77.0\n").unwrap();
+    let (_, laid, _) = output(&["sim", cfg.to_str().unwrap(), "--print-board", "--with", over.to_str().unwrap()]);
+    assert!(laid.contains("start_mm = 77.0") && laid.matches("name = \"x\"").count() == 1, "{laid}");
+}
+
+#[test]
+fn a_try_without_a_klippy_says_what_to_name() {
+    let (_home, cfg) = folder_with("printer.cfg", PRINTER);
+    let cfg = cfg.to_str().unwrap();
+    let (status, out, log) = output(&["sim", cfg, "--try", "--klipper", "/nonexistent", "--json"]);
+    assert_eq!(status, Some(1), "{log}");
+    let report: serde_json::Value = serde_json::from_str(&out).expect(&log);
+    assert_eq!((&report["passed"], &report["steps"][0]["step"]), (&false.into(), &"ready".into()));
+    let text = report["steps"][0]["text"].as_str().unwrap();
+    assert!(text.contains("there is no klippy: name a checkout of Klipper or Kalico with --klipper DIR"), "{text}");
+    let (status, _, log) = output(&["sim", "--try"]);
+    assert_eq!(status, Some(1));
+    assert!(log.contains("need a printer.cfg: name yours"), "{log}");
+}
