@@ -17,7 +17,7 @@ use super::description::axes::AxisConfig;
 use super::description::boards::{Boards, ConstantValue, McuConfig};
 use super::description::check::Trouble;
 use super::description::pin::{PinName, on_board};
-use super::engine::assemble::assemble;
+use super::engine::assemble::{Motion, assemble};
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
@@ -92,7 +92,7 @@ impl SimWorld {
             serial_wires: Vec::new(),
             uarts: Vec::new(),
         };
-        (workshop.world.axes, workshop.world.carriages) = assemble(&printer)?;
+        Motion { axes: workshop.world.axes, carriages: workshop.world.carriages } = assemble(&printer)?;
         for (part, axis) in config.axes.iter().zip(workshop.world.axes.clone()) {
             workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
             workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));

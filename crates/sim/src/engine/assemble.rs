@@ -12,7 +12,17 @@ use crate::description::printer::Printer;
 use crate::description::rails::{Gears, RailConfig};
 
 /// The motors of the description in its order, and its carriages.
-pub(crate) fn assemble(printer: &Printer<'_>) -> Result<(Vec<Arc<Axis>>, Vec<Arc<Rail>>), Trouble> {
+pub(crate) struct Motion {
+    pub(crate) axes: Vec<Arc<Axis>>,
+    pub(crate) carriages: Vec<Arc<Rail>>,
+}
+
+/// Makes the motors and the rails of a printer.
+///
+/// # Errors
+///
+/// The motors do not determine the place of a carriage.
+pub(crate) fn assemble(printer: &Printer<'_>) -> Result<Motion, Trouble> {
     let gears = Gears::of(printer)?;
     let first = |axis: &AxisConfig| printer.first_motor(&axis.name);
     let start_mm = |axis: &AxisConfig| {
@@ -45,5 +55,5 @@ pub(crate) fn assemble(printer: &Printer<'_>) -> Result<(Vec<Arc<Axis>>, Vec<Arc
         }));
     }
     let carriages = rails.into_iter().skip(gears.rails.len() - printer.carriages.len()).collect();
-    Ok((axes, carriages))
+    Ok(Motion { axes, carriages })
 }

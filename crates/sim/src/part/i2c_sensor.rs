@@ -121,13 +121,13 @@ impl Sensor {
         Sensor { chip, heater, clock, written: Vec::new(), answer: Vec::new(), sent: 0, command: Vec::new(), registers }
     }
 
-    fn celsius(&self) -> f64 {
+    fn measure(&self) -> f64 {
         self.heater.at(self.clock.now()).sensor_celsius
     }
 
     /// The answer to the last command.
     fn answer(&self) -> Vec<u8> {
-        let celsius = self.celsius();
+        let celsius = self.measure();
         match (self.chip, self.command.as_slice()) {
             (I2cSensorChip::Bme280, [register, ..]) => {
                 let mut registers = self.registers;

@@ -87,12 +87,12 @@ mod tests {
     #[test]
     fn a_message_sets_its_channel() {
         let mut chip = Chip { chip: SpiDacChip::Ad5206, shift: 0, outputs: [0; 8] };
-        [0x05, 0x80].into_iter().for_each(|byte| drop(chip.exchange(byte)));
+        assert_eq!([0x05, 0x80].map(|byte| chip.exchange(byte)), [0xff; 2]);
         chip.deselect();
         assert_eq!(chip.outputs[5], 0x80);
         let mut chip = Chip { chip: SpiDacChip::Dac084s085, shift: 0, outputs: [0; 8] };
         // Channel C, written and updated: 0x40.
-        [0x94, 0x00].into_iter().for_each(|byte| drop(chip.exchange(byte)));
+        assert_eq!([0x94, 0x00].map(|byte| chip.exchange(byte)), [0xff; 2]);
         chip.deselect();
         assert_eq!(chip.outputs[2], 0x40);
     }
