@@ -20,8 +20,60 @@ const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
 const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
                            [stepper_y]\nposition_min: -5\nposition_max: 310\n\
                            #*# <---------------------- SAVE_CONFIG ---------------------->\n#*# [input_shaper]\n";
-/// The end of config.txt in Raspberry Pi OS 12.
-const CONFIG_TXT: &str = "#dtparam=i2c_arm=on\n#dtparam=spi=on\ndtparam=audio=on\n[cm4]\notg_mode=1\n[all]\n";
+/// The config.txt of Raspberry Pi OS 12.
+const CONFIG_TXT: &str = "\
+# For more options and information see
+# http://rptl.io/configtxt
+# Some settings may impact device functionality. See link above for details
+
+# Uncomment some or all of these to enable the optional hardware interfaces
+#dtparam=i2c_arm=on
+#dtparam=i2s=on
+#dtparam=spi=on
+
+# Enable audio (loads snd_bcm2835)
+dtparam=audio=on
+
+# Additional overlays and parameters are documented
+# /boot/firmware/overlays/README
+
+# Automatically load overlays for detected cameras
+camera_auto_detect=1
+
+# Automatically load overlays for detected DSI displays
+display_auto_detect=1
+
+# Automatically load initramfs files, if found
+auto_initramfs=1
+
+# Enable DRM VC4 V3D driver
+dtoverlay=vc4-kms-v3d
+max_framebuffers=2
+
+# Don't have the firmware create an initial video= setting in cmdline.txt.
+# Use the kernel's default instead.
+disable_fw_kms_setup=1
+
+# Run in 64-bit mode
+arm_64bit=1
+
+# Disable compensation for displays with overscan
+disable_overscan=1
+
+# Run as fast as firmware / board allows
+arm_boost=1
+
+[cm4]
+# Enable host mode on the 2711 built-in XHCI USB controller.
+# This line should be removed if the legacy DWC2 controller is required
+# (e.g. for USB device mode) or if USB support is not required.
+otg_mode=1
+
+[cm5]
+dtoverlay=dwc2,dr_mode=host
+
+[all]
+";
 /// The file of BigTreeTech's image for the CB1.
 const BOARD_ENV: &str = "bootlogo=true\noverlay_prefix=sun50i-h616\nfdtfile=sun50i-h616-biqu-sd\nconsole=display\n\
                          #overlays=tft35_spi\noverlays=ws2812 light\nrootdev=UUID=795df55f\nrootfstype=ext4\n";

@@ -22,7 +22,8 @@ menu.options[sys.argv[1]].method()
 "#;
 
 /// A program of root's that only says what it was asked.
-const SUDO: &str = "#!/bin/sh\necho \"$*\" >>\"$SAID\"\ncase $FAILS in ?*) case $* in *$FAILS*) exit 100 ;; esac ;; esac\n";
+const SUDO: &str =
+    "#!/bin/sh\necho \"$*\" >>\"$SAID\"\ncase $FAILS in ?*) case $* in *$FAILS*) exit 100 ;; esac ;; esac\n";
 
 #[test]
 fn pinion_is_in_kiauh_s_menu_of_extensions() {

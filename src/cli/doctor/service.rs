@@ -25,7 +25,12 @@ pub(super) fn findings(computer: &Computer, instances: &[Instance]) -> Vec<Findi
     let of_each = instances
         .iter()
         .flat_map(|instance| {
-            [Some(state(computer, instance)), former(computer, instance), board(instance), real_time(computer, instance)]
+            [
+                Some(state(computer, instance)),
+                former(computer, instance),
+                board(instance),
+                real_time(computer, instance),
+            ]
         })
         .flatten();
     of_each.chain(c_program(computer, instances)).collect()
