@@ -114,6 +114,7 @@ fn from_nothing_to_a_measured_resonance_and_back() {
     let found_hz = peak(format!("/tmp/calibration_data_x_{name}.csv"), "psd_x");
     assert!((found_hz - 57.0).abs() < 1.0, "{found_hz} Hz");
 
+    printer.until_object("idle_timeout", "state", "Ready");
     let undone = pinion(&["--undo"]);
     assert!(undone["warning"].is_null(), "{undone}");
     assert_eq!(fs::read(&printer_cfg).unwrap(), before);

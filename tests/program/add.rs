@@ -482,7 +482,9 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
             }
             let request = String::from_utf8(request).unwrap();
             let line = request.lines().next().unwrap_or_default().to_owned();
-            let body = if line.contains("objects/query") {
+            let body = if line.contains("fan_generic") {
+                "{\"result\":{\"status\":{\"fan_generic box\":{\"rpm\":1234.0}}}}".to_owned()
+            } else if line.contains("objects/query") {
                 format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
             } else if line.contains("printer/info") {
                 "{\"result\":{\"state\":\"ready\"}}".to_owned()
@@ -533,6 +535,26 @@ fn the_host_restarts_and_measures_and_never_while_it_prints() {
     let (address, server) = moonraker("standby");
     card.added(&["adxl345", "--yes", "--moonraker", &address]);
     assert!(!end(&address, server).iter().any(|request| request.contains("restart")));
+}
+
+#[test]
+fn a_fan_turns_until_its_tachometer_counts_and_leds_light() {
+    let card = Card::pi();
+    let (address, server) = moonraker("standby");
+    let told = card.added(&["fan", "--yes", "--moonraker", &address]);
+    assert!(told.contains("the tachometer counts 1234 turns a minute at full speed"), "{told}");
+    let told = card.added(&["ws2812", "--yes", "--moonraker", &address]);
+    assert!(told.contains("the strip should be red now"), "{told}");
+    let told = card.added(&["fan", "--undo", "--yes", "--moonraker", &address]);
+    assert!(told.contains("The host has restarted without it."), "{told}");
+    let requests = end(&address, server);
+    let scripts: Vec<&str> = requests
+        .iter()
+        .filter_map(|line| line.strip_prefix("POST /printer/gcode/script?script=")?.split(' ').next())
+        .collect();
+    let fan = "SET_FAN_SPEED%20FAN=box%20SPEED=";
+    assert_eq!(scripts[..2], [format!("{fan}1"), format!("{fan}0")]);
+    assert_eq!(scripts[2..], ["SET_LED%20LED=strip%20RED=0.5%20GREEN=0%20BLUE=0"]);
 }
 
 #[test]

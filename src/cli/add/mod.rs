@@ -545,7 +545,7 @@ impl Work<'_> {
                 checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says what is missing"));
             }
         }
-        checks.extend(self.strays());
+        checks.extend(strays(self.computer, self.board, &self.spot));
         let asked = match (&self.way.check, self.way.driver.is_some()) {
             (Some(Check::W1), _) => match self.thermometer(printer) {
                 Some(serial) => Ok(probe::Answer { told: format!("the thermometer {serial} answers"), address: None }),
@@ -570,29 +570,6 @@ impl Work<'_> {
             Ok(answer) => Ok(answer.address),
             Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, self.command())),
         }
-    }
-
-    /// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
-    fn strays(&self) -> Vec<String> {
-        let controllers = self.computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
-        let is_header = |path: &&PathBuf| {
-            let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
-            ["bcm2835", "bcm2711", "rp1"].iter().any(|chip| name.ends_with(chip))
-        };
-        let text = controllers.iter().find(is_header).and_then(|path| self.computer.text(self.computer.name(path)));
-        let text = text.unwrap_or_default();
-        // The driver selects a chip by a line, and 1-Wire is bits on a line.
-        let pins = self.spot.pins.iter().filter(|(role, _)| !["cs", "data"].contains(&role.as_str()));
-        let stray = |(_, pin): (&String, &usize)| {
-            let label = self.board.pins.get(pin - 1)?;
-            let line: u32 = label.strip_prefix("GPIO")?.split(' ').next()?.parse().ok()?;
-            // For example "pin 10 (gpio10) function gpio_out in hi; irq 0 (none)".
-            let is_it = |text: &&str| text.starts_with(&format!("pin {line} ("));
-            let function = text.lines().find(is_it)?.split_once(" function ")?.1.split(' ').next()?;
-            let has = function.starts_with("gpio");
-            has.then(|| format!("pin {pin} ({label}) is a GPIO line now: another program has switched it: reboot, or end that program"))
-        };
-        pins.filter_map(stray).collect()
     }
 
     /// A thermometer that printer.cfg does not have yet.
@@ -779,6 +756,32 @@ impl Work<'_> {
     }
 }
 
+/// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
+fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
+    let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
+    let is_header = |path: &&PathBuf| {
+        let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+        ["bcm2835", "bcm2711", "rp1"].iter().any(|chip| name.ends_with(chip))
+    };
+    let text = controllers.iter().find(is_header).and_then(|path| computer.text(computer.name(path)));
+    let text = text.unwrap_or_default();
+    // The driver selects a chip by a line, and 1-Wire is bits on a line.
+    let pins = spot.pins.iter().filter(|(role, _)| !["cs", "data"].contains(&role.as_str()));
+    let stray = |(_, pin): (&String, &usize)| {
+        let label = board.pins.get(pin - 1)?;
+        let line: u32 = label.strip_prefix("GPIO")?.split(' ').next()?.parse().ok()?;
+        // For example "pin 10 (gpio10) function gpio_out in hi; irq 0 (none)".
+        let is_it = |text: &&str| text.starts_with(&format!("pin {line} ("));
+        let function = text.lines().find(is_it)?.split_once(" function ")?.1.split(' ').next()?;
+        function.starts_with("gpio").then(|| {
+            format!(
+                "pin {pin} ({label}) is a GPIO line now: another program has switched it: end that program, or reboot"
+            )
+        })
+    };
+    pins.filter_map(stray).collect()
+}
+
 /// Lets a fan run at full speed until its tachometer counts.
 fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, String> {
     let speed = |speed: &str| moonraker.run(&format!("SET_FAN_SPEED%20FAN={fan}%20SPEED={speed}"));
@@ -858,6 +861,27 @@ mod tests {
             ("[temperature_sensor room", "sudo pinion add bme280"),
         ];
         assert_eq!(remedies, expected.map(|(found, remedy)| (found.to_owned(), remedy.to_owned())));
+    }
+
+    #[test]
+    fn a_pin_of_the_bus_that_another_program_has_switched_is_named() {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B");
+        // Pin controllers of other chips have pins of the same numbers.
+        tree.put("sys/kernel/debug/pinctrl/107d504100.pinctrl-pinctrl-bcm2712/pins", "pin 11 (gpio11) function gpio\n");
+        let pins = "registered pins: 58\n\
+                    pin 8 (gpio8) function gpio_out in hi; irq 0 (none)\n\
+                    pin 9 (gpio9) function alt0 in lo; irq 0 (none)\n\
+                    pin 10 (gpio10) function gpio_in in lo; irq 0 (none)\n\
+                    pin 11 (gpio11) function alt0 in lo; irq 0 (none)\n";
+        tree.put("sys/kernel/debug/pinctrl/fe200000.gpio-pinctrl-bcm2711/pins", pins);
+        let catalog = Catalog::read().unwrap();
+        let computer = tree.computer();
+        let board = catalog.board(&computer).unwrap();
+        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None).unwrap();
+        let found = strays(&computer, board, &spot);
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(found[0].starts_with("pin 19 (GPIO10 MOSI) is a GPIO line now"), "{found:?}");
     }
 
     #[test]

@@ -219,12 +219,9 @@ impl Printer {
     /// The MCUs of this computer, with their sections. The main one is called `mcu`.
     fn mcus(&self) -> impl Iterator<Item = (&str, &Section)> {
         self.sections.iter().filter_map(|(name, section)| {
-            let name = if name == "mcu" { name } else { name.strip_prefix("mcu ")?.trim() };
-            section
-                .values
-                .get("serial")
-                .is_some_and(|serial| is_host_path(Path::new(serial)))
-                .then_some((name, section))
+            let name = if name == "mcu" { name.as_str() } else { name.strip_prefix("mcu ")?.trim() };
+            let is_own = section.values.get("serial").is_some_and(|serial| is_host_path(Path::new(serial)));
+            is_own.then_some((name, section))
         })
     }
 
