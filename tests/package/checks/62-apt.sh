@@ -41,8 +41,7 @@ identifies
 (pinion doctor || true) | not grep 'a restart is due'
 
 # A package, a list, and a list with its own checksum in Release.
-deb=$(cd $APT && ls pinion-mcu_*.deb later.deb 2>/dev/null | head -n 1)
-printf x >>"$APT/$deb"
+printf x >>$APT/later.deb
 apt-get clean
 refused 'unexpected size|Hash Sum mismatch' apt-get install -y --reinstall pinion-mcu
 serve /share/apt-next
