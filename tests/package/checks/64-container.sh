@@ -1,5 +1,4 @@
 # Pinion in a container, and its host in another one: docs/guide/container.md.
-ROOT=/run/host-root
 systemctl stop pinion-mcu
 rm -f $LINK
 podman load -q -i /share/image/pinion-image-amd64.tar
@@ -11,20 +10,18 @@ pinion_container() {
         --ulimit rtprio=99 --ulimit memlock=-1 -v pinion-pts:/dev/pts:dev -v pinion-tmp:/tmp \
         --device /dev/gpiochip0 --group-add "$(stat -c %g /dev/gpiochip0)" "$@"
 }
-# The host's container: this system's files, klippy's user, and no device.
-mkdir $ROOT
-mount --bind / $ROOT
+# The host's container: klippy's user, and no device.
 host_container() {
-    podman run --rm --network none --user "$(id -u klippy)" --group-add tty -v pinion-pts:/dev/pts:dev -v pinion-tmp:/tmp \
-        -v /share:/share:ro "$@"
+    podman run --rm --network none --user "$(id -u klippy)" --group-add 5 -v pinion-pts:/dev/pts:dev \
+        -v pinion-tmp:/tmp -v /share:/share:ro --entrypoint /share/host "$@"
 }
 has_link() { [ -L "$(podman volume inspect -f '{{.Mountpoint}}' pinion-tmp)/klipper_host_mcu" ]; }
 said_pinion() { podman logs pinion 2>&1; }
 
 pinion_container --pid host localhost/pinion
 until_true 30 has_link
-host_container --rootfs $ROOT:O timeout 20 /share/host identify $LINK HEATER
-host_container --name light --rootfs $ROOT:O /share/host light $LINK HEATER >/run/light 2>&1 &
+host_container localhost/pinion identify $LINK HEATER
+host_container --name light localhost/pinion light $LINK HEATER >/run/light 2>&1 &
 until_true 60 grep -q lit /run/light
 until_true 5 is_high 3
 podman run --rm --network none -v pinion-tmp:/tmp localhost/pinion status
@@ -43,7 +40,7 @@ pinion_container localhost/pinion
 until_true 30 has_link
 until_true 10 eval 'said_pinion | grep -e --pid=host'
 # A stop sets the outputs.
-host_container --name light --rootfs $ROOT:O /share/host light $LINK HEATER >/run/light 2>&1 &
+host_container --name light localhost/pinion light $LINK HEATER >/run/light 2>&1 &
 until_true 60 grep -q lit /run/light
 until_true 5 is_high 3
 podman stop pinion
@@ -52,6 +49,4 @@ podman rm -f light pinion
 wait
 podman volume rm pinion-pts pinion-tmp
 podman image rm localhost/pinion
-umount $ROOT
-rmdir $ROOT
 systemctl start pinion-mcu
