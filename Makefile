@@ -29,6 +29,7 @@ FISHDIR ?= $(PREFIX)/share/fish/vendor_completions.d
 COMPLETER ?= $(PINION)
 DEB_FOLDER ?= $(CARGO_TARGET_DIR)/deb
 RELEASE_FOLDER ?= $(CARGO_TARGET_DIR)/pinion-mcu-release
+IMAGE_FOLDER ?= $(CARGO_TARGET_DIR)/image
 
 # A computer of 32 bits.
 SMALL = armv7-unknown-linux-gnueabihf
@@ -37,10 +38,10 @@ export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
 .PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package test-bare soak soak-real fuzz coverage mutants
-.PHONY: sanitize bench check build install install-program install-sim install-system uninstall deb release clean
+.PHONY: sanitize bench check build install install-program install-sim install-system uninstall deb release image clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build mainsail vm deb system stress check fuzz coverage)
+PACKAGES = $(addprefix system-packages-,build mainsail vm deb release image system stress check fuzz coverage)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -69,7 +70,9 @@ help:
 	@echo 'make install       program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
 	@echo 'make deb           a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
 	@echo '                   in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
-	@echo 'make release       packages for amd64, arm64 and armhf, checksums and notes in $(RELEASE_FOLDER)'
+	@echo 'make release       packages for amd64, arm64 and armhf, checksums and notes in $(RELEASE_FOLDER);'
+	@echo '                   with KEY=NAME (of gpg) also an apt repository, for users at URL=https://...'
+	@echo 'make image         container images for amd64 and arm64, as OCI archives in $(IMAGE_FOLDER)'
 	@echo 'make clean         remove what was built'
 
 run: build
@@ -257,8 +260,19 @@ ARCH ?=
 deb: system-packages-deb
 	@scripts/build-deb '$(DEB_FOLDER)' $(ARCH)
 
-release: system-packages-deb
-	@scripts/release '$(RELEASE_FOLDER)'
+# The secret key of gpg that signs the apt repository, and where users find it.
+KEY ?=
+URL ?=
+release: system-packages-release
+	@scripts/release '$(RELEASE_FOLDER)' '$(KEY)' '$(URL)'
+
+IMAGE_ARCHS ?= amd64 arm64
+image: system-packages-image
+	@for arch in $(IMAGE_ARCHS); do \
+	    scripts/build-deb '$(IMAGE_FOLDER)/deb' $$arch >&2 && \
+	    deb=$$(find '$(IMAGE_FOLDER)/deb' -name "pinion-mcu_*_$$arch.deb") && \
+	    scripts/image '$(IMAGE_FOLDER)' "$$deb" || exit 1; \
+	done; ls -l '$(IMAGE_FOLDER)'/*.tar
 
 clean:
 	'$(CARGO)' clean

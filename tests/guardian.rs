@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
+use pinion_testkit::here;
 
 struct Program {
     child: Child,
@@ -182,4 +183,31 @@ fn a_guardian_that_is_stopped_does_not_outlive_the_program() {
     assert!(status.success(), "{log}");
     assert!(log.contains("is stopped or hangs, and would keep the lines: Pinion kills it"), "{log}");
     wait_until("the guardian is gone", || !exists(guardian));
+}
+
+/// A container with process numbers of its own. The kernel then kills the guardian with the first process.
+#[test]
+fn a_program_that_takes_its_guardian_along_says_so() {
+    if !here::is_root() {
+        return;
+    }
+    const WARNING: &str = "start the container with --pid=host";
+    let program = Program::start();
+    kill(program.pid(), Signal::SIGTERM).unwrap();
+    assert!(!program.end().1.contains(WARNING));
+
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("pty");
+    let mut child = Command::new("unshare")
+        .args(["--pid", "--fork", "--kill-child", env!("CARGO_BIN_EXE_pinion"), "run", "-g", "0", "-I"])
+        .arg(&link)
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    wait_until("the link appears", || link.exists());
+    kill(Pid::from_raw(child.id() as i32), Signal::SIGKILL).unwrap();
+    child.wait().unwrap();
+    let mut log = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+    assert!(log.contains(WARNING), "{log}");
 }

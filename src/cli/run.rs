@@ -3,12 +3,14 @@
 
 #![forbid(unsafe_code)]
 
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::Args;
 use log::LevelFilter;
+use nix::unistd::{Pid, getpid, getppid};
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
@@ -112,10 +114,26 @@ pub fn run(args: &RunArgs, log_level: Option<LevelFilter>, simulated: Open) -> E
     if let Some(file) = &args.config {
         log::info!("configuration {}", file.display());
     }
+    if helpers.guardian.is_some() && dies_with_its_guardian() {
+        log::warn!(
+            "this container has process numbers of its own: if Pinion dies, the kernel kills its guardian, too, and outputs \
+             keep their levels: start the container with --pid=host"
+        );
+    }
     let guard = helpers.guardian.as_ref().map(Guardian::guard);
     let (board, timing) = simulation.unwrap_or_else(|| linux(Arc::new(clock), guard, settings.fast_gpio));
     match pinion_runtime::run(&settings.options(), board, timing, recording, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }
+}
+
+/// Whether the kernel kills the guardian when this process ends. It kills all processes of a PID namespace with the first
+/// one. That is this process, or the small init of a container, which ends with this process.
+fn dies_with_its_guardian() -> bool {
+    // The namespace of the computer itself (PROC_PID_INIT_INO of include/linux/proc_ns.h).
+    const OUTSIDE: &str = "pid:[4026531836]";
+    let first = Pid::from_raw(1);
+    let has_own_numbers = fs::read_link("/proc/self/ns/pid").is_ok_and(|namespace| namespace.as_os_str() != OUTSIDE);
+    has_own_numbers && (getpid() == first || getppid() == first && !Path::new("/run/systemd/system").exists())
 }

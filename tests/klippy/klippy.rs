@@ -218,7 +218,8 @@ impl Printer {
         path
     }
 
-    fn path(&self, name: &str) -> PathBuf {
+    /// A path in the printer's folder.
+    pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 

@@ -5,6 +5,7 @@
 //! klippy's requirements (scripts/klippy-requirements.txt there). Without the checkout every test here is skipped, and
 //! says so.
 
+mod add;
 mod drivers;
 mod filament;
 mod hosts;

@@ -49,7 +49,7 @@ fn table(file: String) -> (Vec<String>, Vec<Vec<f64>>) {
 }
 
 /// The maximum of a column of a spectrum: between the bins, on the parabola through three of them.
-fn peak(file: String, column: &str) -> f64 {
+pub fn peak(file: String, column: &str) -> f64 {
     let (columns, lines) = table(file);
     let column = columns.iter().position(|name| name == column).unwrap();
     let power = |bin: usize| lines[bin][column].ln();
@@ -60,7 +60,7 @@ fn peak(file: String, column: &str) -> f64 {
 }
 
 /// The G-code of a test around a resonance, 12 Hz to either side of it. It takes twelve seconds.
-fn sweep(hz: f64) -> String {
+pub fn sweep(hz: f64) -> String {
     format!("FREQ_START={} FREQ_END={} HZ_PER_SEC=2", hz - 12.0, hz + 12.0)
 }
 

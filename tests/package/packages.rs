@@ -54,6 +54,34 @@ pub fn share(folder: &Path) -> Result<(), String> {
     )
 }
 
+/// apt repositories as a release has them, signed by a key that is made for this: `apt`, and `apt-next` with the later
+/// package. The VM sees them below /share.
+pub fn share_repositories(folder: &Path) -> Result<(), String> {
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
+    let home = tempfile::tempdir().map_err(|error| format!("a folder for gpg: {error}"))?;
+    process::pipeline(
+        r#"export GNUPGHOME="$3"
+           gpg --batch --quiet --passphrase '' --quick-generate-key 'Test <test@localhost>' ed25519 sign never
+           cd "$1"
+           mkdir apt apt-next
+           cp pinion-mcu.deb pinion-sim.deb apt
+           cp later.deb pinion-sim.deb apt-next
+           "$2/apt-repository" apt test@localhost file:/srv/pinion-apt
+           "$2/apt-repository" apt-next test@localhost file:/srv/pinion-apt
+           gpgconf --kill gpg-agent"#,
+        &[&folder.display().to_string(), &scripts.display().to_string(), &home.path().display().to_string()],
+    )
+}
+
+/// The container image, made twice: the same packages give the same bytes. `sources` is a sources.list of Debian 12.
+pub fn share_image(folder: &Path, sources: &Path) -> Result<(), String> {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/image");
+    for name in ["image", "again"] {
+        process::run(Command::new(&script).arg(folder.join(name)).arg(folder.join("pinion-mcu.deb")).arg(sources))?;
+    }
+    process::pipeline(r#"cd "$1"; cmp image/*.tar again/*.tar; rm -r again"#, &[&folder.display().to_string()])
+}
+
 /// klippy from the checkout in KLIPPER_DIR, if it is set. It is for klippy's own checks: see `guest/klippy.sh`. klippy
 /// compiles its C library here, because this is also a Debian 12 for x86-64.
 pub fn share_klippy(folder: &Path) -> Result<(), String> {

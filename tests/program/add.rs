@@ -20,8 +20,60 @@ const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
 const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
                            [stepper_y]\nposition_min: -5\nposition_max: 310\n\
                            #*# <---------------------- SAVE_CONFIG ---------------------->\n#*# [input_shaper]\n";
-/// The end of config.txt in Raspberry Pi OS 12.
-const CONFIG_TXT: &str = "#dtparam=i2c_arm=on\n#dtparam=spi=on\ndtparam=audio=on\n[cm4]\notg_mode=1\n[all]\n";
+/// The config.txt of Raspberry Pi OS 12.
+const CONFIG_TXT: &str = "\
+# For more options and information see
+# http://rptl.io/configtxt
+# Some settings may impact device functionality. See link above for details
+
+# Uncomment some or all of these to enable the optional hardware interfaces
+#dtparam=i2c_arm=on
+#dtparam=i2s=on
+#dtparam=spi=on
+
+# Enable audio (loads snd_bcm2835)
+dtparam=audio=on
+
+# Additional overlays and parameters are documented
+# /boot/firmware/overlays/README
+
+# Automatically load overlays for detected cameras
+camera_auto_detect=1
+
+# Automatically load overlays for detected DSI displays
+display_auto_detect=1
+
+# Automatically load initramfs files, if found
+auto_initramfs=1
+
+# Enable DRM VC4 V3D driver
+dtoverlay=vc4-kms-v3d
+max_framebuffers=2
+
+# Don't have the firmware create an initial video= setting in cmdline.txt.
+# Use the kernel's default instead.
+disable_fw_kms_setup=1
+
+# Run in 64-bit mode
+arm_64bit=1
+
+# Disable compensation for displays with overscan
+disable_overscan=1
+
+# Run as fast as firmware / board allows
+arm_boost=1
+
+[cm4]
+# Enable host mode on the 2711 built-in XHCI USB controller.
+# This line should be removed if the legacy DWC2 controller is required
+# (e.g. for USB device mode) or if USB support is not required.
+otg_mode=1
+
+[cm5]
+dtoverlay=dwc2,dr_mode=host
+
+[all]
+";
 /// The file of BigTreeTech's image for the CB1.
 const BOARD_ENV: &str = "bootlogo=true\noverlay_prefix=sun50i-h616\nfdtfile=sun50i-h616-biqu-sd\nconsole=display\n\
                          #overlays=tft35_spi\noverlays=ws2812 light\nrootdev=UUID=795df55f\nrootfstype=ext4\n";
@@ -430,7 +482,9 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
             }
             let request = String::from_utf8(request).unwrap();
             let line = request.lines().next().unwrap_or_default().to_owned();
-            let body = if line.contains("objects/query") {
+            let body = if line.contains("fan_generic") {
+                "{\"result\":{\"status\":{\"fan_generic box\":{\"rpm\":1234.0}}}}".to_owned()
+            } else if line.contains("objects/query") {
                 format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
             } else if line.contains("printer/info") {
                 "{\"result\":{\"state\":\"ready\"}}".to_owned()
@@ -481,6 +535,26 @@ fn the_host_restarts_and_measures_and_never_while_it_prints() {
     let (address, server) = moonraker("standby");
     card.added(&["adxl345", "--yes", "--moonraker", &address]);
     assert!(!end(&address, server).iter().any(|request| request.contains("restart")));
+}
+
+#[test]
+fn a_fan_turns_until_its_tachometer_counts_and_leds_light() {
+    let card = Card::pi();
+    let (address, server) = moonraker("standby");
+    let told = card.added(&["fan", "--yes", "--moonraker", &address]);
+    assert!(told.contains("the tachometer counts 1234 turns a minute at full speed"), "{told}");
+    let told = card.added(&["ws2812", "--yes", "--moonraker", &address]);
+    assert!(told.contains("the strip should be red now"), "{told}");
+    let told = card.added(&["fan", "--undo", "--yes", "--moonraker", &address]);
+    assert!(told.contains("The host has restarted without it."), "{told}");
+    let requests = end(&address, server);
+    let scripts: Vec<&str> = requests
+        .iter()
+        .filter_map(|line| line.strip_prefix("POST /printer/gcode/script?script=")?.split(' ').next())
+        .collect();
+    let fan = "SET_FAN_SPEED%20FAN=box%20SPEED=";
+    assert_eq!(scripts[..2], [format!("{fan}1"), format!("{fan}0")]);
+    assert_eq!(scripts[2..], ["SET_LED%20LED=strip%20RED=0.5%20GREEN=0%20BLUE=0"]);
 }
 
 #[test]

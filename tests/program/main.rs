@@ -12,6 +12,7 @@ mod dialects;
 mod disk;
 mod doctor;
 mod hostile;
+mod kiauh;
 mod life;
 mod links;
 mod one_order;

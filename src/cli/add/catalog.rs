@@ -339,7 +339,19 @@ impl Board {
         wanted: Option<usize>,
     ) -> Result<Vec<Wire>, String> {
         let own: BTreeSet<usize> = spot.pins.values().copied().collect();
-        let is_free = |pin: &usize| !own.contains(pin) && self.line(*pin).is_some_and(|line| !taken.contains(line));
+        // Each of a line's names counts: GPIO17, gpio17, gpiochip0/gpio17, pinctrl-bcm2711/gpio17.
+        let is_taken = |line: &str| {
+            let name_of = |line: &str| line.rsplit('/').next().unwrap_or(line).to_ascii_lowercase();
+            let is_of_header =
+                |other: &str| !other.contains('/') || other.starts_with("gpiochip") || other.starts_with("pinctrl-");
+            taken.iter().any(|other| other == line || is_of_header(other) && name_of(other) == name_of(line))
+        };
+        // On a Raspberry Pi the label of a bus's pin begins with the line's name.
+        let label = |pin: usize| self.pins.get(pin - 1).and_then(|label| label.split(' ').next()).unwrap_or_default();
+        if let Some(pin) = own.iter().find(|pin| label(**pin).starts_with("GPIO") && is_taken(label(**pin))) {
+            return Err(format!("printer.cfg uses {} (pin {pin}) for something else: the bus needs it", label(*pin)));
+        }
+        let is_free = |pin: &usize| !own.contains(pin) && self.line(*pin).is_some_and(|line| !is_taken(line));
         let mut free = self.free.iter().copied().filter(is_free).filter(|pin| Some(*pin) != wanted);
         let mut wires = Vec::new();
         for (chip, role) in &way.wires {
@@ -369,7 +381,9 @@ impl Board {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::boards;
     use crate::cli::computer::tests::Tree;
+    use pinion_linux::gpio::Chip;
     use std::fs;
     use std::path::Path;
 
@@ -457,6 +471,31 @@ mod tests {
         assert!(name("BigTreeTech CB1", "#BTT_PAD7=\"ON\"\n").contains("40 pins"));
     }
 
+    /// On the device trees of boards that people own.
+    #[test]
+    fn each_line_is_one_of_the_board() {
+        let catalog = Catalog::read().unwrap();
+        let mut known = 0;
+        for board in boards::all() {
+            let tree = board.tree();
+            let Some(own) = catalog.board(&tree.computer()) else { continue };
+            let chips = board.inventory(&tree).chips;
+            let is_there = |line: &str| {
+                let is_named =
+                    chips.iter().flat_map(|chip| &chip.lines).any(|other| other.name.as_deref() == Some(line));
+                let numbered = |chip: &Chip| line.strip_prefix(&format!("{}/gpio", chip.label))?.parse::<usize>().ok();
+                is_named || chips.iter().any(|chip| numbered(chip).is_some_and(|number| number < chip.lines.len()))
+            };
+            // One of these trees has a Raspberry Pi 5 without its header.
+            if chips.iter().any(|chip| !chip.label.contains("brcmstb")) {
+                known += 1;
+                let missing: Vec<&String> = own.lines.values().filter(|line| !is_there(line)).collect();
+                assert!(missing.is_empty(), "{}: {missing:?}", own.name);
+            }
+        }
+        assert!(known >= 5, "{known}");
+    }
+
     #[test]
     fn two_devices_are_not_put_on_the_same_pins() {
         let catalog = Catalog::read().unwrap();
@@ -483,6 +522,17 @@ mod tests {
     }
 
     #[test]
+    fn a_bus_does_not_take_a_pin_that_printer_cfg_uses() {
+        let catalog = Catalog::read().unwrap();
+        let (board, way) = (&catalog.boards[1], &catalog.device("adxl345").unwrap().way[0]);
+        let spot = board.spot(way, &|_, _| None).unwrap();
+        let wires = |taken: &str| board.wires(way, &spot, &[taken.to_owned()].into(), None);
+        assert!(wires("gpio17").is_ok());
+        assert!(wires("gpio10").unwrap_err().starts_with("printer.cfg uses GPIO10 (pin 19)"));
+        assert!(wires("GPIO8").unwrap_err().contains("the bus needs it"));
+    }
+
+    #[test]
     fn a_line_is_one_that_nothing_uses() {
         let catalog = Catalog::read().unwrap();
         let (board, way) = (&catalog.boards[1], &catalog.device("relay").unwrap().way[0]);
@@ -492,6 +542,8 @@ mod tests {
         };
         assert_eq!(line(&[], None), Ok(11));
         assert_eq!(line(&["GPIO17", "GPIO27"], None), Ok(15));
+        assert_eq!(line(&["gpio17", "pinctrl-bcm2711/gpio27"], None), Ok(15), "klipper_mcu's names");
+        assert_eq!(line(&["pca9555/gpio17"], None), Ok(11), "another chip's line");
         assert_eq!(line(&[], Some(40)), Ok(40));
         assert_eq!(line(&[], Some(29)), Ok(29), "it is not among the proposed ones, and it is a line");
         for wrong in [0, 1, 6, 41, usize::MAX] {

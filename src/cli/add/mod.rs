@@ -12,6 +12,8 @@ use std::fmt::Display;
 use std::io::{self, BufRead as _, IsTerminal as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use clap::{Args, ValueHint};
 use nix::unistd::geteuid;
@@ -40,8 +42,12 @@ use printer::Printer;
 
 /// The folder of the records of root's files.
 const STATE: &str = "/var/lib/pinion-mcu/add";
+/// Where Moonraker answers, if nobody says otherwise.
+const MOONRAKER: &str = "127.0.0.1:7125";
 /// The file that loads the driver of /dev/i2c-*.
 const MODULES: &str = "/etc/modules-load.d/pinion-i2c-dev.conf";
+/// How long a fan may take until its tachometer counts. klippy reports a speed each second.
+const SPIN_UP: Duration = Duration::from_secs(6);
 /// The key of the change of the boot loader's settings, with the bus behind it.
 const BUS: &str = "bus";
 
@@ -64,7 +70,7 @@ pub(super) struct AddArgs {
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
     /// Where Moonraker answers
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7125", value_hint = ValueHint::Other)]
+    #[arg(long, value_name = "ADDRESS", default_value = MOONRAKER, value_hint = ValueHint::Other)]
     moonraker: String,
     /// Show what would be done, and change nothing
     #[arg(long, conflicts_with = "undo")]
@@ -296,13 +302,20 @@ fn undo(
     if reboots {
         report.line("The bus is off after a reboot, unless another device needs it.");
     }
-    report.line("Run FIRMWARE_RESTART in the host.");
+    if computer.is_this() || args.moonraker != MOONRAKER {
+        let restarted = Moonraker(&args.moonraker).restart();
+        report.set("warning", json!(restarted.as_ref().err()));
+        report.line(match restarted {
+            Ok(()) => "The host has restarted without it.".to_owned(),
+            Err(why) => format!("{why}: run FIRMWARE_RESTART in the host"),
+        });
+    }
     Ok(())
 }
 
 /// Fails if the host prints, or if nobody says whether it does.
 fn refuse_while_printing(args: &AddArgs, computer: &Computer) -> Result<(), String> {
-    if !computer.is_this() && args.moonraker == "127.0.0.1:7125" {
+    if !computer.is_this() && args.moonraker == MOONRAKER {
         return Ok(());
     }
     match Moonraker(&args.moonraker).host() {
@@ -532,6 +545,7 @@ impl Work<'_> {
                 checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says what is missing"));
             }
         }
+        checks.extend(strays(self.computer, self.board, &self.spot));
         let asked = match (&self.way.check, self.way.driver.is_some()) {
             (Some(Check::W1), _) => match self.thermometer(printer) {
                 Some(serial) => Ok(probe::Answer { told: format!("the thermometer {serial} answers"), address: None }),
@@ -604,7 +618,7 @@ impl Work<'_> {
         if !is_changed {
             self.report.line("Nothing is left to change.");
         }
-        if self.computer.is_this() || self.args.moonraker != "127.0.0.1:7125" {
+        if self.computer.is_this() || self.args.moonraker != MOONRAKER {
             self.measure(is_changed);
         }
         self.report.set("next", json!(self.device.next));
@@ -715,8 +729,19 @@ impl Work<'_> {
                 let values = lines.iter().find_map(|line| acceleration(line));
                 return values.ok_or_else(|| "ACCELEROMETER_QUERY answers no values: see klippy.log".to_owned())?;
             }
+            if let Some(fan) = self.device.section.strip_prefix("fan_generic ") {
+                return turns(&moonraker, &self.device.section, fan);
+            }
+            if let Some(strip) = self.device.section.strip_prefix("neopixel ") {
+                moonraker.run(&format!("SET_LED%20LED={strip}%20RED=0.5%20GREEN=0%20BLUE=0"))?;
+                return Ok(
+                    "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
+                           dark, check its 5 V, its ground, and that the wire goes to DIN"
+                        .into(),
+                );
+            }
             if self.device.section.starts_with("temperature_sensor ") {
-                let degrees = moonraker.temperature(&self.device.section)?;
+                let degrees = moonraker.value(&self.device.section, "temperature")?;
                 return match (-40.0..=150.0).contains(&degrees) {
                     true => Ok(format!("the host reads {degrees:.1} degrees")),
                     false => Err(format!("the host reads {degrees:.1} degrees: check the sensor's wires and type")),
@@ -728,6 +753,51 @@ impl Work<'_> {
         self.report.set("measured", json!(told.as_ref().ok()));
         self.report.set("warning", json!(told.as_ref().err()));
         self.report.line(told.unwrap_or_else(|why| why));
+    }
+}
+
+/// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
+fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
+    let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
+    let is_header = |path: &&PathBuf| {
+        let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+        ["bcm2835", "bcm2711", "rp1"].iter().any(|chip| name.ends_with(chip))
+    };
+    let text = controllers.iter().find(is_header).and_then(|path| computer.text(computer.name(path)));
+    let text = text.unwrap_or_default();
+    // The driver selects a chip by a line, and 1-Wire is bits on a line.
+    let pins = spot.pins.iter().filter(|(role, _)| !["cs", "data"].contains(&role.as_str()));
+    let stray = |(_, pin): (&String, &usize)| {
+        let label = board.pins.get(pin - 1)?;
+        let line: u32 = label.strip_prefix("GPIO")?.split(' ').next()?.parse().ok()?;
+        // For example "pin 10 (gpio10) function gpio_out in hi; irq 0 (none)".
+        let is_it = |text: &&str| text.starts_with(&format!("pin {line} ("));
+        let function = text.lines().find(is_it)?.split_once(" function ")?.1.split(' ').next()?;
+        function.starts_with("gpio").then(|| {
+            format!(
+                "pin {pin} ({label}) is a GPIO line now: another program has switched it: end that program, or reboot"
+            )
+        })
+    };
+    pins.filter_map(stray).collect()
+}
+
+/// Lets a fan run at full speed until its tachometer counts.
+fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, String> {
+    let speed = |speed: &str| moonraker.run(&format!("SET_FAN_SPEED%20FAN={fan}%20SPEED={speed}"));
+    let end = Instant::now() + SPIN_UP;
+    speed("1")?;
+    let counted = loop {
+        let rpm = moonraker.value(section, "rpm");
+        if rpm.as_ref().is_ok_and(|rpm| *rpm > 0.0) || Instant::now() >= end {
+            break rpm;
+        }
+        thread::sleep(Duration::from_millis(500));
+    };
+    speed("0")?;
+    match counted? {
+        rpm if rpm > 0.0 => Ok(format!("the tachometer counts {rpm:.0} turns a minute at full speed")),
+        _ => Err("the tachometer counts nothing at full speed: check that the fan runs, and its yellow wire".into()),
     }
 }
 
@@ -791,6 +861,27 @@ mod tests {
             ("[temperature_sensor room", "sudo pinion add bme280"),
         ];
         assert_eq!(remedies, expected.map(|(found, remedy)| (found.to_owned(), remedy.to_owned())));
+    }
+
+    #[test]
+    fn a_pin_of_the_bus_that_another_program_has_switched_is_named() {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B");
+        // Pin controllers of other chips have pins of the same numbers.
+        tree.put("sys/kernel/debug/pinctrl/107d504100.pinctrl-pinctrl-bcm2712/pins", "pin 11 (gpio11) function gpio\n");
+        let pins = "registered pins: 58\n\
+                    pin 8 (gpio8) function gpio_out in hi; irq 0 (none)\n\
+                    pin 9 (gpio9) function alt0 in lo; irq 0 (none)\n\
+                    pin 10 (gpio10) function gpio_in in lo; irq 0 (none)\n\
+                    pin 11 (gpio11) function alt0 in lo; irq 0 (none)\n";
+        tree.put("sys/kernel/debug/pinctrl/fe200000.gpio-pinctrl-bcm2711/pins", pins);
+        let catalog = Catalog::read().unwrap();
+        let computer = tree.computer();
+        let board = catalog.board(&computer).unwrap();
+        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None).unwrap();
+        let found = strays(&computer, board, &spot);
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(found[0].starts_with("pin 19 (GPIO10 MOSI) is a GPIO line now"), "{found:?}");
     }
 
     #[test]

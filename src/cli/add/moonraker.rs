@@ -21,7 +21,9 @@ const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Longest answer that is read. The console's last lines have some kilobytes.
 const ANSWER_MAX: u64 = 4 << 20;
 /// How often klippy's state is asked while it starts.
-const POLL: Duration = Duration::from_millis(500);
+const POLL: Duration = Duration::from_millis(100);
+/// How long klippy may take until it has left its old state.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// A Moonraker.
 pub(super) struct Moonraker<'a>(pub(super) &'a str);
@@ -64,18 +66,23 @@ impl Moonraker<'_> {
     /// One line: Moonraker's or klippy's own words.
     pub(super) fn restart(&self) -> Result<(), String> {
         self.ask("POST", "/printer/firmware_restart").map_err(|refused| refused.why)?;
-        let end = Instant::now() + START_TIMEOUT;
+        let asked = Instant::now();
+        let mut was_away = false;
         loop {
             thread::sleep(POLL);
             let info = self.ask("GET", "/printer/info");
-            match info.as_ref().map(|info| info["result"]["state"].as_str().unwrap_or_default()) {
-                Ok("ready") => return Ok(()),
-                Ok("error" | "shutdown") => {
+            let state = info.as_ref().map_or("", |info| info["result"]["state"].as_str().unwrap_or_default());
+            was_away |= !["ready", "error", "shutdown"].contains(&state);
+            // At first the answer may still be that of before.
+            let is_new = was_away || asked.elapsed() >= LEAVE_TIMEOUT;
+            match state {
+                "ready" if is_new => return Ok(()),
+                "error" | "shutdown" if is_new => {
                     let message = info.as_ref().ok().and_then(|info| info["result"]["state_message"].as_str());
                     let message = message.and_then(|message| message.lines().next()).unwrap_or("see klippy.log");
                     return Err(format!("klippy says: {message}"));
                 }
-                _ if Instant::now() < end => {}
+                _ if asked.elapsed() < START_TIMEOUT => {}
                 _ => return Err("klippy is not ready after a minute: see klippy.log".into()),
             }
         }
@@ -100,16 +107,16 @@ impl Moonraker<'_> {
         Ok(after.into_iter().filter(|line| !before.contains(line)).map(|(_, line)| line).collect())
     }
 
-    /// The temperature of a sensor.
+    /// A number that klippy reports of a section, such as a sensor's temperature.
     ///
     /// # Errors
     ///
     /// One line: Moonraker's words, or there is none.
-    pub(super) fn temperature(&self, section: &str) -> Result<f64, String> {
+    pub(super) fn value(&self, section: &str, key: &str) -> Result<f64, String> {
         let query = format!("/printer/objects/query?{}", section.replace(' ', "%20"));
         let answer = self.ask("GET", &query).map_err(|refused| refused.why)?;
-        let temperature = answer["result"]["status"][section]["temperature"].as_f64();
-        temperature.ok_or_else(|| format!("klippy has no temperature of [{section}]"))
+        let value = answer["result"]["status"][section][key].as_f64();
+        value.ok_or_else(|| format!("klippy has no {key} of [{section}]"))
     }
 
     fn ask(&self, method: &str, path: &str) -> Result<Value, Refused> {
@@ -248,7 +255,8 @@ mod tests {
             &*text.leak()
         };
         served(vec![OK, info("startup"), info("ready")], |moonraker| assert_eq!(moonraker.restart(), Ok(())));
-        served(vec![OK, info("error")], |moonraker| {
+        // The first answers are those of before.
+        served(vec![OK, info("error"), info("ready"), info("startup"), info("error")], |moonraker| {
             assert_eq!(moonraker.restart(), Err("klippy says: Option 'x'".into()));
         });
     }
@@ -257,8 +265,9 @@ mod tests {
     fn a_temperature_has_a_section() {
         let answer =
             "HTTP/1.1 200 OK\r\n\r\n{\"result\":{\"status\":{\"temperature_sensor a\":{\"temperature\":21.5}}}}";
-        let requests =
-            served(vec![answer], |moonraker| assert_eq!(moonraker.temperature("temperature_sensor a"), Ok(21.5)));
+        let requests = served(vec![answer], |moonraker| {
+            assert_eq!(moonraker.value("temperature_sensor a", "temperature"), Ok(21.5))
+        });
         assert_eq!(requests, ["GET /printer/objects/query?temperature_sensor%20a"]);
     }
 }

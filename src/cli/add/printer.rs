@@ -178,12 +178,18 @@ impl Printer {
         self.sections.get(&device.section)?.files.iter().find(|file| **file != own).map(PathBuf::as_path)
     }
 
-    /// The pins that printer.cfg uses, without those of the device's own file.
+    /// The pins of this computer that printer.cfg uses, without those of the device's own file.
     pub(super) fn taken(&self, device: &Device) -> BTreeSet<String> {
         let own = self.file(device.name);
+        let mcus: BTreeSet<&str> = self.mcus().map(|(name, _)| name).collect();
         let others = self.sections.values().filter(|section| !section.files.contains(&own));
         let pins = others.flat_map(|section| &section.values).filter(|(key, _)| key.contains("pin"));
-        pins.flat_map(|(_, pins)| pins.split(',')).map(|pin| name_of(pin).to_owned()).collect()
+        // Another MCU may have pins of the same names. A pin without a name in front is the main MCU's.
+        let mcu_of = |pin: &str| {
+            pin.trim_start_matches([' ', '!', '^', '~']).split_once(':').map_or("mcu", |(mcu, _)| mcu.trim()).to_owned()
+        };
+        let pins = pins.flat_map(|(_, pins)| pins.split(',')).filter(|pin| mcus.contains(mcu_of(pin).as_str()));
+        pins.map(|pin| name_of(pin).to_owned()).collect()
     }
 
     /// The section other than the device's own that uses this node of a bus.
@@ -210,14 +216,18 @@ impl Printer {
         others.filter_map(|section| section.values.get("serial_no").map(String::as_str)).collect()
     }
 
+    /// The MCUs of this computer, with their sections. The main one is called `mcu`.
+    fn mcus(&self) -> impl Iterator<Item = (&str, &Section)> {
+        self.sections.iter().filter_map(|(name, section)| {
+            let name = if name == "mcu" { name.as_str() } else { name.strip_prefix("mcu ")?.trim() };
+            let is_own = section.values.get("serial").is_some_and(|serial| is_host_path(Path::new(serial)));
+            is_own.then_some((name, section))
+        })
+    }
+
     /// The name of this computer's MCU, and whether it has to be added.
     pub(super) fn mcu(&self) -> (String, bool) {
-        let own = |(name, section): (&String, &Section)| {
-            let name = name.strip_prefix("mcu ")?.trim().to_owned();
-            let is_host = section.values.get("serial").is_some_and(|serial| is_host_path(Path::new(serial)));
-            is_host.then(|| (name, section.files.iter().all(|file| *file == self.file("host-mcu"))))
-        };
-        self.sections.iter().find_map(own).map_or(("host".into(), true), |(name, _)| (name, false))
+        self.mcus().next().map_or(("host".into(), true), |(name, _)| (name.to_owned(), false))
     }
 
     /// The link by which klippy finds this computer's MCU.
@@ -393,6 +403,23 @@ mod tests {
         assert_eq!(taken("light"), ["GPIO17", "GPIO22", "gpio27"]);
         assert_eq!(taken("relay"), ["GPIO17", "gpio27"], "a second call chooses the same line");
         assert_eq!(printer.probe_point().unwrap(), "0, 0, 20");
+    }
+
+    #[test]
+    fn pins_of_another_mcu_are_not_this_computer_s() {
+        let taken = |text: &str| {
+            let catalog = Catalog::read().unwrap();
+            let (_tree, printer) = read(&[("printer.cfg", text)]);
+            let taken = printer.taken(catalog.device("relay").unwrap());
+            (printer.mcu().0, taken.into_iter().collect::<Vec<_>>())
+        };
+        // A main board whose pins have a Raspberry Pi's names.
+        let pico = "[mcu]\nserial: /dev/serial/by-id/x\n[fan]\npin: gpio17\n[mcu pi]\nserial: /tmp/klipper_host_mcu\n\
+                    [output_pin a]\npin: !pi:gpio27\n";
+        assert_eq!(taken(pico), ("pi".into(), vec!["gpio27".into()]));
+        // Pinion as the only MCU.
+        let alone = "[mcu]\nserial: /tmp/klipper_host_mcu\n[fan]\npin: !GPIO17\n[x]\na_pins: mcu:GPIO5, ^ebb:GPIO6\n";
+        assert_eq!(taken(alone), ("mcu".into(), vec!["GPIO17".into(), "GPIO5".into()]));
     }
 
     #[test]

@@ -247,8 +247,11 @@ fn hex(bytes: &[u8]) -> String {
 mod tests {
     use super::*;
     use pinion_firmware::trouble::Trouble;
+    use pinion_linux::clock::Monotonic;
+    use pinion_sim::{SimBoard, SimConfig};
     use proptest::prelude::*;
     use std::collections::BTreeMap;
+    use std::sync::Arc;
 
     /// Chips that answer a register with these bytes, one after the other. SPI has the address 0.
     #[derive(Clone, Default)]
@@ -352,6 +355,42 @@ mod tests {
         assert_eq!(crc8(&[0xbe, 0xef]), 0x92);
         assert!(told("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
         assert!(told("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
+    }
+
+    /// The chips of a simulated printer.
+    struct Simulated(SimBoard);
+
+    impl Buses for Simulated {
+        fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+            let bus = self.0.spi_buses().iter().find(|bus| bus.name == "spidev0.0").unwrap().first;
+            let config = SpiConfig { bus, mode: way.mode, rate_hz: way.rate_hz, chip_select: None };
+            self.0.spi(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())
+        }
+
+        fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String> {
+            let bus = self.0.i2c_buses().first().unwrap().first;
+            let config = I2cConfig { bus, address, rate_hz: I2C_RATE_HZ };
+            self.0.i2c(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())
+        }
+    }
+
+    #[test]
+    fn the_simulated_printer_s_chips_are_known() {
+        let described = concat!(env!("CARGO_MANIFEST_DIR"), "/crates/sim/src/default.toml");
+        let described = std::fs::read_to_string(described).unwrap();
+        // The accelerometer has the bus of the header for itself.
+        let described = described.replace("bus = \"spidev0.0\"", "bus = \"spidev9.0\"").replace(
+            "kind = \"adxl345\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
+            "kind = \"adxl345\"\nbus = \"spidev0.0\"",
+        ) + "\n[[spi_bus]]\nname = \"spidev9.0\"\n";
+        let config = SimConfig::parse(&described, "this test").unwrap();
+        let mut chips = Simulated(SimBoard::new(config, Arc::new(Monotonic::start())).unwrap());
+        let catalog = Catalog::read().unwrap();
+        let mut told = |device: &str| ask(&catalog, &catalog.device(device).unwrap().way[0], &mut chips);
+        assert_eq!(told("adxl345").unwrap().told, "its id is 0xe5");
+        assert!(told("lis2dw").is_err());
+        assert_eq!(told("ssd1306").unwrap().address, Some(0x3c));
+        assert!(told("bme280").unwrap_err().starts_with("nobody answers at 0x76 or 0x77"));
     }
 
     proptest! {

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::fs;
 use std::path::Path;
 
 use crate::cli::computer::manager::watchdog_of_systemd;
@@ -23,7 +24,14 @@ const SCHED_FIFO: &str = "1";
 pub(super) fn findings(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     let of_each = instances
         .iter()
-        .flat_map(|instance| [Some(state(computer, instance)), board(instance), real_time(computer, instance)])
+        .flat_map(|instance| {
+            [
+                Some(state(computer, instance)),
+                former(computer, instance),
+                board(instance),
+                real_time(computer, instance),
+            ]
+        })
         .flatten();
     of_each.chain(c_program(computer, instances)).collect()
 }
@@ -53,6 +61,16 @@ fn state(computer: &Computer, instance: &Instance) -> Finding {
         (None, false) if is_installed => Finding::warning(CHECK, "Pinion does not run", enable),
         (None, false) => Finding::warning(CHECK, "Pinion does not run, and its service is not installed", INSTALL),
     }
+}
+
+/// A program that an update has replaced, and that still runs. `None` also if the caller may not see the program.
+fn former(computer: &Computer, instance: &Instance) -> Option<Finding> {
+    let pid = instance.pid?;
+    let program = fs::read_link(computer.path(format!("/proc/{pid}/exe"))).ok()?;
+    // The kernel's words for a file that another one has replaced.
+    program.to_str()?.strip_suffix(" (deleted)")?;
+    let found = format!("an update has replaced the program of process {pid}, which goes on: a restart is due");
+    Some(Finding::warning("version", found, format!("when no print runs: {}", instance.restart())))
 }
 
 /// `None` for an instance that has this computer's pins, as it should be.
@@ -190,7 +208,6 @@ mod tests {
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use std::fs;
 
     fn found(tree: &Tree) -> Vec<Finding> {
         let computer = tree.called_by(990);
@@ -220,6 +237,24 @@ mod tests {
         let findings = found(&tree);
         told(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
         assert_eq!(findings.iter().filter(|finding| finding.check == "service").count(), 1);
+    }
+
+    #[test]
+    fn a_program_that_an_update_has_replaced_is_due_for_a_restart() {
+        let tree = Tree::new();
+        tree.put("usr/lib/systemd/system/pinion-mcu.service", "");
+        tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
+        tree.put("proc/10/cgroup", "0::/system.slice/pinion-mcu.service\n");
+        let program = tree.computer().path("/proc/10/exe");
+        let is_due = |target: &str| {
+            fs::remove_file(&program).unwrap();
+            tree.link("proc/10/exe", target);
+            found(&tree).iter().any(|finding| finding.check == "version")
+        };
+        assert!(!is_due("/usr/bin/pinion"));
+        assert!(is_due("/usr/bin/pinion (deleted)"));
+        let remedy = told(&found(&tree), "version", Warning, "process 10, which goes on: a restart is due");
+        assert_eq!(remedy, "when no print runs: sudo systemctl restart pinion-mcu");
     }
 
     #[test]

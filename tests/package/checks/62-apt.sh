@@ -1,0 +1,65 @@
+# The apt repository of a release: added by its four lines, installed, and upgraded while the service serves. A file that
+# somebody has changed is refused.
+export DEBIAN_FRONTEND=noninteractive
+APT=/srv/pinion-apt
+# serve FOLDER: the repository's files are now these.
+serve() { rm -rf $APT && cp -r "$1" $APT; }
+update() { apt-get update </dev/null 2>&1 | tee /run/apt && not grep '^[WE]:' /run/apt; }
+# refused WORDS COMMAND...: the command fails with these words.
+refused() {
+    not "${@:2}" </dev/null >/run/apt 2>&1
+    grep -E "$1" /run/apt
+}
+version() { dpkg-query -W -f '${Version}' pinion-mcu; }
+
+apt-get -qq purge -y pinion-mcu pinion-sim
+serve /share/apt
+is "$(wc -l <$APT/pinion.sources)" 4 "the number of lines"
+grep -q '^Signed-By: /etc/apt/keyrings/pinion.asc$' $APT/pinion.sources
+mkdir -p /etc/apt/sources.list.d
+install -D -m 644 $APT/pinion.asc /etc/apt/keyrings/pinion.asc
+install -m 644 $APT/pinion.sources /etc/apt/sources.list.d/
+update
+apt-get install -y --no-install-recommends pinion-mcu </dev/null
+is "$(version)" "$(dpkg-deb -f /share/pinion-mcu.deb Version)" "the version"
+
+# A print goes on with the old program.
+light
+before=$(pid)
+(pinion doctor || true) | not grep 'a restart is due'
+serve /share/apt-next
+update
+apt-get upgrade -y </dev/null
+is "$(version)" "$(dpkg-deb -f /share/later.deb Version)" "the version"
+is "$(pid)" "$before" "the process"
+sleep 4
+is_high 3
+(pinion doctor || true) | grep -A 2 'a restart is due' | grep 'systemctl restart pinion-mcu'
+dark
+systemctl restart pinion-mcu
+identifies
+(pinion doctor || true) | not grep 'a restart is due'
+
+# A package, a list, and a list with its own checksum in Release.
+printf x >>$APT/later.deb
+apt-get clean
+refused 'unexpected size|Hash Sum mismatch' apt-get install -y --reinstall pinion-mcu
+serve /share/apt-next
+sed -i 's/^Depends: /&evil, /' $APT/Packages
+gzip -9 -n -k -f $APT/Packages
+rm -r /var/lib/apt/lists/*pinion*
+refused 'unexpected size|Hash Sum mismatch' apt-get update -o APT::Update::Error-Mode=any
+for list in Packages Packages.gz; do
+    sed -i "s/^ [0-9a-f]* [0-9]* $list$/ $(sha256sum $APT/$list | cut -d ' ' -f 1) $(stat -c %s $APT/$list) $list/" $APT/InRelease
+done
+refused 'invalid|BADSIG' apt-get update -o APT::Update::Error-Mode=any
+# Without the signature.
+cp $APT/Release /run/Release
+rm $APT/InRelease
+refused 'not signed|no longer signed' apt-get update -o APT::Update::Error-Mode=any
+
+rm -r /etc/apt/sources.list.d/pinion.sources /etc/apt/keyrings/pinion.asc $APT
+apt-get -qq update
+# The next checks need the package as delivered.
+apt-get install -y --allow-downgrades /share/pinion-mcu.deb /share/pinion-sim.deb
+systemctl restart pinion-mcu
