@@ -192,8 +192,8 @@ fn keep_last(trace: &mut Trace, span: Duration) {
     let is_state = |event: &Event| {
         matches!(
             event,
-            Event::ErrandBegan { .. }
-                | Event::ErrandEnded { .. }
+            Event::JobBegan { .. }
+                | Event::JobEnded { .. }
                 | Event::Held
                 | Event::Released
                 | Event::Scheduling { .. }

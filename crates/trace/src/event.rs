@@ -89,15 +89,15 @@ pub enum Event {
     /// A sync byte came between blocks: the host's computer is there, and its host says nothing.
     Alive,
 
-    /// A worker began an errand.
-    ErrandBegan {
+    /// A worker began a job.
+    JobBegan {
         /// The object that sent it; `None` for one without an oid.
         oid: Option<u8>,
         /// How long it waited for the worker.
         waited: Ticks,
     },
-    /// A worker finished its errand.
-    ErrandEnded {
+    /// A worker finished its job.
+    JobEnded {
         /// The object that sent it; `None` for one without an oid.
         oid: Option<u8>,
         /// How long it took.
@@ -206,8 +206,8 @@ impl Event {
             Event::Nak => (26, 0),
             Event::Answered { id } => (27, id.cast_unsigned().into()),
             Event::Alive => (28, 0),
-            Event::ErrandBegan { oid, waited } => (30, pair(waited.0, number(oid))),
-            Event::ErrandEnded { oid, took } => (31, pair(took.0, number(oid))),
+            Event::JobBegan { oid, waited } => (30, pair(waited.0, number(oid))),
+            Event::JobEnded { oid, took } => (31, pair(took.0, number(oid))),
             Event::Processor { thread: Watched::Core, ran, waited } => (40, pair(ran.0, waited.0)),
             Event::Processor { thread: Watched::Link, ran, waited } => (41, pair(ran.0, waited.0)),
             Event::Stolen(ticks) => (42, ticks.0.into()),
@@ -252,8 +252,8 @@ impl Event {
             26 => Event::Nak,
             27 => Event::Answered { id: low as i16 },
             28 => Event::Alive,
-            30 => Event::ErrandBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
-            31 => Event::ErrandEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },
+            30 => Event::JobBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
+            31 => Event::JobEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },
             40 => Event::Processor { thread: Watched::Core, ran: Ticks(low), waited: Ticks(high) },
             41 => Event::Processor { thread: Watched::Link, ran: Ticks(low), waited: Ticks(high) },
             42 => Event::Stolen(Ticks(low)),

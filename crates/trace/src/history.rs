@@ -66,7 +66,7 @@ impl Deed {
 
     /// Whether nothing tells of its end. It seems to last until the end of the recording.
     pub fn is_open(&self) -> bool {
-        matches!(self.event, Event::Held | Event::ErrandBegan { .. })
+        matches!(self.event, Event::Held | Event::JobBegan { .. })
     }
 }
 
@@ -227,10 +227,10 @@ impl<'a> History<'a> {
             Event::Answered { id } => format!("answered {} without the core", self.command(id)),
             Event::Alive => "the host's computer gave a sign of life".to_owned(),
             Event::Full => "the core has no room for the host's blocks".to_owned(),
-            Event::ErrandBegan { oid, .. } => {
+            Event::JobBegan { oid, .. } => {
                 format!("works for {}. It did not end within {span} ms, when the recording ended", self.object(oid))
             }
-            Event::ErrandEnded { oid, .. } => {
+            Event::JobEnded { oid, .. } => {
                 let waited = match deed.waited {
                     Ticks(0) => String::new(),
                     Ticks(ticks) => format!(", after {} ms in the queue", ms(ticks.into())),
@@ -296,7 +296,7 @@ pub(super) fn at_ms(at: i64) -> String {
 fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Deed> {
     let mut deeds = Vec::with_capacity(events.len());
     let mut held = None;
-    let mut errand: Option<Deed> = None;
+    let mut job: Option<Deed> = None;
     for &(at, event) in events {
         let after = |span: Ticks| at.saturating_sub(span.0.into());
         let mut waited = Ticks(0);
@@ -309,14 +309,14 @@ fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Dee
                 continue;
             }
             Event::Released => held.take().unwrap_or(at),
-            Event::ErrandBegan { waited, .. } => {
+            Event::JobBegan { waited, .. } => {
                 let began = Deed { from: at, to: end, event, waited };
-                if let Some(lost) = errand.replace(began) {
+                if let Some(lost) = job.replace(began) {
                     deeds.push(Deed { to: at, ..lost });
                 }
                 continue;
             }
-            Event::ErrandEnded { took, .. } => match errand.take() {
+            Event::JobEnded { took, .. } => match job.take() {
                 Some(began) => {
                     waited = began.waited;
                     began.from
@@ -328,7 +328,7 @@ fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Dee
         deeds.push(Deed { from, to: at, event, waited });
     }
     deeds.extend(held.map(|from| Deed { from, to: end, event: Event::Held, waited: Ticks(0) }));
-    deeds.extend(errand);
+    deeds.extend(job);
     deeds
 }
 
@@ -368,12 +368,12 @@ pub(super) mod tests {
         }
         for at in (2..900).step_by(20) {
             let took = if at == 882 { 12_000 } else { 400 };
-            bus.push((ms(at), Event::ErrandBegan { oid: Some(7), waited: Ticks::from_us(20) }));
-            bus.push((ms(at) + took, Event::ErrandEnded { oid: Some(7), took: Ticks::from_us(took as u32) }));
+            bus.push((ms(at), Event::JobBegan { oid: Some(7), waited: Ticks::from_us(20) }));
+            bus.push((ms(at) + took, Event::JobEnded { oid: Some(7), took: Ticks::from_us(took as u32) }));
             lasting.push((ms(at), Event::Held));
             lasting.push((ms(at) + took, Event::Released));
         }
-        bus.push((ms(990), Event::ErrandBegan { oid: Some(7), waited: Ticks(0) }));
+        bus.push((ms(990), Event::JobBegan { oid: Some(7), waited: Ticks(0) }));
         lasting.insert(0, (10, Event::Configured));
         lasting.insert(1, (20, Event::Scheduling { fifo: true }));
         lasting.push((ms(910), Event::Late { oid: Some(3), late: Ticks::from_us(310) }));
@@ -474,14 +474,14 @@ pub(super) mod tests {
     #[test]
     fn a_deed_lasts_from_its_cause_to_its_end() {
         let (began, ended) = (
-            Event::ErrandBegan { oid: Some(1), waited: Ticks(7) },
-            Event::ErrandEnded { oid: Some(1), took: Ticks::from_us(3) },
+            Event::JobBegan { oid: Some(1), waited: Ticks(7) },
+            Event::JobEnded { oid: Some(1), took: Ticks::from_us(3) },
         );
         let woke = Event::Woke { slept: Ticks::from_us(40), late: Ticks(0) };
         let core = [(100, woke), (110, Event::Block(1)), (200, Event::Held)];
         let lasting = [(120, Event::Held), (130, Event::Released)];
         let link = [(90, Event::BlockIn(1))];
-        // The first errand began before the recording; nothing tells of the ends of the third and the fourth.
+        // The first job began before the recording; nothing tells of the ends of the third and the fourth.
         let bus = [(10, ended), (20, began), (25, ended), (30, began), (60, began)];
         let trace = trace(End::Died, &[("core", &core), ("spi0", &bus), ("core", &lasting), ("link", &link)]);
         let history = History::of(&trace);

@@ -149,7 +149,7 @@ impl<W: Write> File<'_, W> {
         let slice = match deed.event {
             Event::Woke { .. } => Some("asleep".to_owned()),
             Event::Held | Event::Released => Some("commands wait for a bus".to_owned()),
-            Event::ErrandBegan { oid, .. } | Event::ErrandEnded { oid, .. } => Some(history.object(oid)),
+            Event::JobBegan { oid, .. } | Event::JobEnded { oid, .. } => Some(history.object(oid)),
             _ => None,
         };
         if let Some(name) = slice {

@@ -160,7 +160,7 @@ fn rows(history: &History<'_>, window: &Window) -> Vec<Row> {
         let plural = if left_out == 1 { "" } else { "s" };
         rows.push(row(&format!("(and {left_out} output{plural})"), OTHER, Vec::new(), false));
     }
-    let busy = |event: &Event| matches!(event, Event::ErrandBegan { .. } | Event::ErrandEnded { .. });
+    let busy = |event: &Event| matches!(event, Event::JobBegan { .. } | Event::JobEnded { .. });
     let buses = history.lanes.iter().filter(|lane| lane.deeds.iter().any(|deed| busy(&deed.event)));
     rows.extend(buses.take(BUSES_MAX).map(|lane| row(&short(lane.thread), BUS, of(&lane.deeds, busy), false)));
     let sleeps: Vec<(i64, i64)> = of(core, |event| matches!(event, Event::Woke { .. }));

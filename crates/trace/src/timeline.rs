@@ -70,7 +70,7 @@ fn place(deed: &Deed) -> i64 {
 }
 
 fn is_range(deed: &Deed) -> bool {
-    matches!(deed.event, Event::Held | Event::Released | Event::ErrandBegan { .. } | Event::ErrandEnded { .. })
+    matches!(deed.event, Event::Held | Event::Released | Event::JobBegan { .. } | Event::JobEnded { .. })
 }
 
 /// How much a deed is of note; zero if it is routine. Being late weighs more than waiting, which weighs more than work.
@@ -80,7 +80,7 @@ fn weight(deed: &Deed) -> u64 {
     };
     match deed.event {
         Event::Stopped { .. } | Event::Due(_) => u64::MAX,
-        Event::Held | Event::ErrandBegan { .. } => over(deed.ticks(), LONG_WAIT, 1000),
+        Event::Held | Event::JobBegan { .. } => over(deed.ticks(), LONG_WAIT, 1000),
         Event::Configured
         | Event::Reset
         | Event::HostCame
@@ -93,7 +93,7 @@ fn weight(deed: &Deed) -> u64 {
         Event::Processor { waited, .. } => over(waited.0.into(), LONG_WAIT, 100),
         Event::Stolen(ticks) => over(ticks.0.into(), LONG_WAIT, 100),
         Event::Released => over(deed.ticks(), LONG_WAIT, 10),
-        Event::ErrandEnded { .. } => over(deed.ticks(), LONG_WORK, 1),
+        Event::JobEnded { .. } => over(deed.ticks(), LONG_WORK, 1),
         Event::Pace { .. }
         | Event::Block(_)
         | Event::Command { .. }
@@ -222,7 +222,7 @@ impl Fold {
             Event::Refused(_) => (Kind::Refused, 0),
             Event::Nak => (Kind::Naks, 0),
             Event::Out(bytes) => (Kind::Wrote, bytes.into()),
-            Event::ErrandBegan { .. } | Event::ErrandEnded { .. } => (Kind::Work, deed.ticks()),
+            Event::JobBegan { .. } | Event::JobEnded { .. } => (Kind::Work, deed.ticks()),
             Event::Processor { waited, .. } => (Kind::Processor, waited.0.into()),
             Event::Looked { .. } => (Kind::Looked, 0),
             Event::Stolen(ticks) => (Kind::Stolen, ticks.0.into()),

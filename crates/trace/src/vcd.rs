@@ -218,7 +218,7 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
         }),
     ];
     for lane in &history.lanes {
-        let busy = when(&lane.deeds, |event| matches!(event, Event::ErrandBegan { .. } | Event::ErrandEnded { .. }));
+        let busy = when(&lane.deeds, |event| matches!(event, Event::JobBegan { .. } | Event::JobEnded { .. }));
         if !busy.is_empty() {
             signals.push(Signal::new(&format!("busy_{}", short(lane.thread)), first(&lane.deeds), busy));
         }

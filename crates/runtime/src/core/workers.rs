@@ -244,10 +244,10 @@ impl Server {
         self.shown.begin();
         let began = self.clock.now();
         let (number, holds) = (job.oid().number(), job.holds());
-        self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
+        self.record(began, Event::JobBegan { oid: number, waited: span(submitted, began) });
         let ended = self.clock.run_job(&mut || job.run(&mut self.devices));
         self.shown.end();
-        self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
+        self.record(ended, Event::JobEnded { oid: number, took: span(began, ended) });
         // This does not fail: there are no more jobs under way than boxes, and both queues have the same length.
         let _ = self.done.push(Finished { job, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.

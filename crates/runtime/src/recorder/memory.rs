@@ -118,13 +118,13 @@ impl Memory {
     }
 
     /// The writer of a worker. A bus gets its earlier ring again. `None`: all rings are in use, and this worker's
-    /// errands are not recorded.
+    /// jobs are not recorded.
     pub(super) fn worker(self, bus: &str) -> Option<Writer> {
         let rings = || (WORKERS..RINGS).map(|ring| self.ring(ring));
         let (own, unused) = (rings().filter(|ring| ring.name() == bus), rings().filter(|ring| ring.name().is_empty()));
         let writer = own.chain(unused).chain(rings()).find_map(|ring| Writer::lasting(ring, bus));
         if writer.is_none() {
-            debug!("the errands of {bus} are not recorded: there is room for {WORKERS_MAX} buses");
+            debug!("the jobs of {bus} are not recorded: there is room for {WORKERS_MAX} buses");
         }
         writer
     }

@@ -250,11 +250,11 @@ impl<'a> Record<'a> {
         for (at, thread, event) in &self.events {
             let Thread::Other(bus) = thread else { continue };
             match *event {
-                Event::ErrandBegan { oid, .. } => {
+                Event::JobBegan { oid, .. } => {
                     open.retain(|job| job.bus != *bus);
                     open.push(Job { bus, oid, span: (*at, FAR), is_open: true });
                 }
-                Event::ErrandEnded { oid, took } => {
+                Event::JobEnded { oid, took } => {
                     open.retain(|job| job.bus != *bus);
                     jobs.push(Job { bus, oid, span: (at - i64::from(took.0), *at), is_open: false });
                 }

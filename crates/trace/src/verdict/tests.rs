@@ -195,9 +195,9 @@ fn a_block_that_waits_for_a_bus_is_told_with_the_bus() {
         Scene::calm()
             .and("link", came, Event::BlockIn(BLOCK))
             .and("core", STOP - 50_000, Event::Held)
-            .and("spi0", STOP - 50_000, Event::ErrandBegan { oid: Some(3), waited: Ticks(0) })
+            .and("spi0", STOP - 50_000, Event::JobBegan { oid: Some(3), waited: Ticks(0) })
             .and("core", STOP - 9_000, Event::Released)
-            .and("spi0", STOP - 9_000, Event::ErrandEnded { oid: Some(3), took: ms(41) })
+            .and("spi0", STOP - 9_000, Event::JobEnded { oid: Some(3), took: ms(41) })
             .and("core", STOP - 100, Event::Block(BLOCK))
             .stop(BLOCK, STOP - 20_000)
     };
@@ -413,9 +413,9 @@ fn a_standstill_is_told_with_what_went_on() {
 fn a_bus_that_hangs_is_named() {
     let hangs = Scene::calm()
         .and("core", STOP - 5 * SECOND, Event::Held)
-        .and("spi0", STOP - 5 * SECOND, Event::ErrandBegan { oid: Some(3), waited: Ticks(0) })
-        .and("i2c1", STOP - 6 * SECOND, Event::ErrandBegan { oid: Some(4), waited: Ticks(0) })
-        .and("i2c1", STOP - 5 * SECOND, Event::ErrandEnded { oid: Some(4), took: ms(1000) });
+        .and("spi0", STOP - 5 * SECOND, Event::JobBegan { oid: Some(3), waited: Ticks(0) })
+        .and("i2c1", STOP - 6 * SECOND, Event::JobBegan { oid: Some(4), waited: Ticks(0) })
+        .and("i2c1", STOP - 5 * SECOND, Event::JobEnded { oid: Some(4), took: ms(1000) });
     let text =
         "spi0 has not answered for 5.0 s (stepper oid 3): check the power and the wires of its devices, and dmesg";
     let stopped = hangs.clone().and("core", STOP, Event::Stopped { block: 7 });
