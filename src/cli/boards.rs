@@ -73,7 +73,7 @@ impl Board {
                 None if names.is_empty() => {}
                 None => tree.put(&format!("{device}/of_node/gpio-line-names"), names + "\0"),
             }
-            tree.put(&format!("{device}/gpiochip{number}/dev"), &format!("254:{number}\n"));
+            tree.put(&format!("{device}/gpiochip{number}/dev"), format!("254:{number}\n"));
             let link = format!("sys/bus/gpio/devices/gpiochip{number}");
             tree.link(&link, &format!("../../../devices/platform/{}/gpiochip{number}", chip.device));
         }
@@ -85,7 +85,7 @@ impl Board {
         }
         for (number, device, channels) in self.pwm {
             let chip = format!("sys/class/pwm/pwmchip{number}");
-            tree.put(&format!("{chip}/npwm"), &format!("{channels}\n"));
+            tree.put(&format!("{chip}/npwm"), format!("{channels}\n"));
             tree.put(&format!("{chip}/export"), "");
             tree.link(&format!("{chip}/device"), &format!("../../../{device}"));
         }

@@ -97,7 +97,8 @@ impl Others {
         if !self.0.is_empty() {
             end_all();
         }
-        self.0.into_iter().fold(true, |right, thread| matches!(thread.join(), Ok(Ok(()))) && right)
+        let ends: Vec<bool> = self.0.into_iter().map(|thread| matches!(thread.join(), Ok(Ok(())))).collect();
+        ends.into_iter().all(|right| right)
     }
 }
 

@@ -446,7 +446,7 @@ mod tests {
         let catalog = Catalog::read().unwrap();
         let name = |model: &str, system_cfg: &str| {
             let tree = Tree::new();
-            tree.put("proc/device-tree/model", &format!("{model}\0"));
+            tree.put("proc/device-tree/model", format!("{model}\0"));
             tree.put("boot/system.cfg", system_cfg);
             catalog.board(&tree.computer()).map(|board| board.name.clone()).unwrap_or_default()
         };

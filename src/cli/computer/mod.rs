@@ -320,7 +320,7 @@ pub(super) mod tests {
         pub(in crate::cli) fn process(&self, pid: u32, arguments: &[&str], uid: u32, gids: &[u32]) {
             let gids: Vec<String> = gids.iter().map(u32::to_string).collect();
             self.put(&format!("proc/{pid}/cmdline"), &(arguments.join("\0") + "\0"));
-            self.put(&format!("proc/{pid}/stat"), &format!("{pid} (x) S {} 0", ["1"; 20].join(" ")));
+            self.put(&format!("proc/{pid}/stat"), format!("{pid} (x) S {} 0", ["1"; 20].join(" ")));
             let ids = [uid; 4].map(|uid| uid.to_string()).join("\t");
             let status = format!("Name:\tx\nUid:\t{ids}\nGid:\t{ids}\nGroups:\t{}\n", gids.join(" "));
             self.put(&format!("proc/{pid}/status"), &status);

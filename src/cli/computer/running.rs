@@ -255,7 +255,7 @@ mod tests {
         let tree = Tree::new();
         tree.process(7, &["pinion"], MALLORY, &[]);
         let unit = |group: &str| {
-            tree.put("proc/7/cgroup", &format!("0::{group}\n"));
+            tree.put("proc/7/cgroup", format!("0::{group}\n"));
             tree.computer().starter_of(7).unit()
         };
         assert_eq!(unit("/system.slice/system-pinion.slice/pinion-mcu@b.service").as_deref(), Some("pinion-mcu@b"));
@@ -339,7 +339,7 @@ mod tests {
         tree.put("proc/7/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
         let starter = |uids: &str, mode: u32| {
             tree.process(7, &["pinion"], 0, &[]);
-            tree.put("proc/7/status", &format!("Uid:\t{uids}\nGid:\t0\t0\t0\t0\nGroups:\t\n"));
+            tree.put("proc/7/status", format!("Uid:\t{uids}\nGid:\t0\t0\t0\t0\nGroups:\t\n"));
             tree.mode("proc/7/exe", mode);
             tree.computer().starter_of(7)
         };

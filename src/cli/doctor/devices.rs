@@ -605,7 +605,7 @@ mod tests {
         let tree = Tree::new();
         NODES.iter().for_each(|(_, path)| tree.put_mode(path, "", 0o660));
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
-        tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
+        tree.put("etc/group", format!("gpio:x:{gid}:\n"));
         tree.put("etc/pinion/pinion.toml", "watchdog = true\nfast_gpio = \"on\"\n");
         let findings = permitted(&tree, &stranger(vec![gid]));
         assert_eq!(findings.len(), NODES.len());
@@ -621,7 +621,7 @@ mod tests {
     fn fast_lines_that_were_asked_for_and_cannot_be_had() {
         let tree = Tree::new();
         let wish = |wish: &str| {
-            tree.put("etc/pinion/pinion.toml", &format!("fast_gpio = \"{wish}\"\n"));
+            tree.put("etc/pinion/pinion.toml", format!("fast_gpio = \"{wish}\"\n"));
             permitted(&tree, &stranger(vec![]))
         };
         let remedy = told(&wish("on"), "fast_gpio", Warning, "there is no /dev/gpiomem");
@@ -659,7 +659,7 @@ mod tests {
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
         let passwd = "root:x:0:0:::\npinion:x:54321:54321:::\npi:x:54322:54322:::\n";
         tree.put("etc/passwd", passwd);
-        tree.put("etc/group", &format!("gpio:x:{gid}:pi\n"));
+        tree.put("etc/group", format!("gpio:x:{gid}:pi\n"));
         // The service would run as pinion.
         told(&look(), "gpio", Error, "pinion may not open");
         // A running process counts, with its groups.
@@ -674,7 +674,7 @@ mod tests {
         let findings = look();
         assert_eq!(findings.len(), 2, "{findings:?}");
         told(&findings, "gpio", Fine, "pi may open");
-        tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
+        tree.put("etc/group", format!("gpio:x:{gid}:\n"));
         let remedy = told(&look(), "gpio", Error, "pi may not open");
         assert_eq!(remedy, "sudo usermod -aG gpio pi, then sudo systemctl restart klipper-mcu");
         let unit = "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\nSupplementaryGroups=gpio\n";

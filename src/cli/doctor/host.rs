@@ -226,7 +226,7 @@ mod tests {
     fn klippy_is_found_by_its_unit() {
         let tree = Tree::new();
         assert!(klippys(&tree.computer()).is_empty());
-        tree.put("etc/passwd", &format!("pi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
+        tree.put("etc/passwd", format!("pi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
         tree.put("etc/systemd/system/klipper-mcu.service", "ExecStart=/usr/local/bin/klipper_mcu -r\n");
         let unit = "[Service]\nUser=pi\nEnvironmentFile=-/home/pi/klipper.env\nExecStart=/home/pi/env/bin/python $KLIPPER_ARGS\n";
         tree.put("etc/systemd/system/klipper.service", unit);
@@ -280,9 +280,9 @@ mod tests {
                 format!("mcu.lookup_command(\"{name} {}\")\n", parameters.join(" "))
             })
             .collect();
-        tree.put("home/pi/klipper/klippy/mcu.py", &forms.concat());
+        tree.put("home/pi/klipper/klippy/mcu.py", forms.concat());
         told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
-        let speak = |name: &str| tree.put("etc/pinion/pinion.toml", &format!("dialect = \"{name}\"\n"));
+        let speak = |name: &str| tree.put("etc/pinion/pinion.toml", format!("dialect = \"{name}\"\n"));
         speak("v0.12");
         told(&look(), "dialect", Ok, "as Pinion is told");
         speak("kalico");

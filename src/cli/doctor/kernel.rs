@@ -184,7 +184,7 @@ mod tests {
     use crate::cli::finding::Level::{Error, Ok, Warning};
 
     fn found(tree: &Tree, cpu: Option<usize>) -> Vec<Finding> {
-        tree.put("etc/pinion/pinion.toml", &cpu.map_or(String::new(), |cpu| format!("cpu = {cpu}\n")));
+        tree.put("etc/pinion/pinion.toml", cpu.map_or(String::new(), |cpu| format!("cpu = {cpu}\n")));
         findings(&tree.computer(), &instances(&tree.computer()).0)
     }
 

@@ -222,9 +222,9 @@ mod tests {
         for (pid, unit) in
             [(7, "klipper"), (8, "klippy\\x20\x1b\u{202e};reboot"), (17, "pinion-mcu"), (18, "pinion $(id)")]
         {
-            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+            tree.put(&format!("proc/{pid}/cgroup"), format!("0::/system.slice/{unit}.service\n"));
         }
-        tree.put(&config[1..], &format!("[mcu]\nserial: /tmp/klipper_host_{}\n", name.replace('\n', "")));
+        tree.put(&config[1..], format!("[mcu]\nserial: /tmp/klipper_host_{}\n", name.replace('\n', "")));
         tree.put(&format!("etc/systemd/system/multi-user.target.wants/pinion-mcu@{name}.service"), "");
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux\x1b[2J\"");
         tree.put("etc/pinion/pinion.toml", "symlink\x1b[2J = 1\n");

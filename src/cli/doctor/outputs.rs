@@ -59,7 +59,7 @@ mod tests {
         let tree = Tree::new();
         assert!(released(&tree.computer()).is_empty(), "this kernel does not say");
         let parameter = |module: &str, value: &str| {
-            tree.put(&format!("sys/module/{module}/parameters/persist_gpio_outputs"), &format!("{value}\n"));
+            tree.put(&format!("sys/module/{module}/parameters/persist_gpio_outputs"), format!("{value}\n"));
         };
         parameter("pinctrl_bcm2835", "Y");
         tree.put("boot/firmware/config.txt", "");

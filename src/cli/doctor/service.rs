@@ -284,9 +284,9 @@ mod tests {
         tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
         told(&found(&tree), "realtime", Ok, "unknown");
         let stat = |policy: &str| format!("11 (co) re) S {} {policy} 0", vec!["0"; 37].join(" "));
-        tree.put("proc/10/task/11/stat", &stat("0"));
+        tree.put("proc/10/task/11/stat", stat("0"));
         told(&found(&tree), "realtime", Warning, "not permitted");
-        tree.put("proc/10/task/12/stat", &stat("1"));
+        tree.put("proc/10/task/12/stat", stat("1"));
         told(&found(&tree), "realtime", Ok, "runs in real time");
         // Each instance is judged.
         tree.process(12, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 990, &[]);

@@ -246,8 +246,8 @@ mod tests {
         tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
         ["", "tmp", "run", "run/pinion", "dev/pts"].iter().for_each(|folder| tree.mode(folder, 0o755));
         let gid = fs::metadata(tree.computer().path("/dev/pts/3")).unwrap().gid();
-        tree.put("etc/group", &format!("tty:x:{gid}:\n"));
-        tree.put("etc/passwd", &format!("root:x:0:0::/root:/bin/sh\npi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
+        tree.put("etc/group", format!("tty:x:{gid}:\n"));
+        tree.put("etc/passwd", format!("root:x:0:0::/root:/bin/sh\npi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
         (tree, gid)
     }
 
@@ -275,7 +275,7 @@ mod tests {
             told(&looked(&tree), "terminal", Error, "pi, klippy's user (process 8), may not open it"),
             "sudo usermod -aG tty pi && sudo systemctl restart klipper"
         );
-        tree.put("etc/group", &format!("tty:x:{gid}:other,pi\n"));
+        tree.put("etc/group", format!("tty:x:{gid}:other,pi\n"));
         assert!(told(&looked(&tree), "terminal", Error, "may not open").starts_with("sudo systemctl restart klipper"));
         tree.mode("dev/pts/3", 0o600);
         assert!(told(&looked(&tree), "terminal", Error, "may not open").starts_with("mode = "));
@@ -286,7 +286,7 @@ mod tests {
     #[test]
     fn nobody_is_made_a_member_of_root_s_group() {
         let (tree, gid) = with_terminal(0o660);
-        tree.put("etc/group", &format!("root:x:{gid}:\n"));
+        tree.put("etc/group", format!("root:x:{gid}:\n"));
         tree.process(8, &KLIPPY, PI, &[]);
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
         let remedy = told(&looked(&tree), "terminal", Error, "may not open it");
@@ -341,14 +341,14 @@ mod tests {
             let config = format!("/etc/pinion/{name}.toml");
             tree.process(pid, &["/usr/bin/pinion", "run", "-r", "-I", &link, "--config", &config], 990, &[]);
             tree.put(&config[1..], "");
-            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+            tree.put(&format!("proc/{pid}/cgroup"), format!("0::/system.slice/{unit}.service\n"));
         }
         for (pid, user, unit, serial) in [(21, "pi", "klipper", "mcu"), (22, "other", "klipper-2", "b")] {
             let (script, config) =
                 (format!("/home/{user}/klipper/klippy/klippy.py"), format!("/home/{user}/printer.cfg"));
-            tree.put(&config[1..], &format!("[mcu host]\nserial: /tmp/klipper_host_{serial}\n"));
+            tree.put(&config[1..], format!("[mcu host]\nserial: /tmp/klipper_host_{serial}\n"));
             tree.process(pid, &["/usr/bin/python3", &script, &config], PI + pid - 21, &[gid]);
-            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+            tree.put(&format!("proc/{pid}/cgroup"), format!("0::/system.slice/{unit}.service\n"));
         }
         (tree, gid)
     }

@@ -220,10 +220,13 @@ impl Trial<'_> {
             }
             return;
         }
-        if step != "ready" && step != "homed" {
-            if self.host.restart().is_ok() && self.until_ready().is_ok() && self.host.gcode("G28", LONG).is_ok() {
-                return;
-            }
+        if step != "ready"
+            && step != "homed"
+            && self.host.restart().is_ok()
+            && self.until_ready().is_ok()
+            && self.host.gcode("G28", LONG).is_ok()
+        {
+            return;
         }
         self.broken = Some("klippy is not ready".into());
     }

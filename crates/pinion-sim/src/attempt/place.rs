@@ -20,8 +20,8 @@ fn pin(config: &Config, name: &str) -> Option<Place> {
         parsed.is_ok_and(|pin| pin.name == name || aliases.resolve(&pin).name == name)
     };
     let uses = config.sections().iter().filter(|section| section.kind() != "board_pins").flat_map(Section::settings);
-    let uses = uses.filter(|setting| setting.key.contains("pin") && setting.value.split(',').any(is_it));
-    uses.last().map(|setting| setting.place.clone())
+    let mut uses = uses.filter(|setting| setting.key.contains("pin") && setting.value.split(',').any(is_it));
+    uses.next_back().map(|setting| setting.place.clone())
 }
 
 /// The line that a message of klippy is about.
