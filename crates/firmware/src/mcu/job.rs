@@ -282,7 +282,9 @@ impl Mcu {
         while let Some(finished) = self.state.workers.completion() {
             self.take_back(finished);
         }
-        self.reset_if_due();
+        if self.state.phase.is_reset_due() {
+            self.reset_if_due();
+        }
     }
 
     fn take_back(&mut self, mut finished: Finished) {
