@@ -130,7 +130,7 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     assert_eq!(boards[0]["pins"].as_array().unwrap(), &["PD1".into()]);
     assert_eq!(notes.len(), 1);
     assert!(notes[0].to_string().ends_with(
-        "printer.cfg:70: [beacon] is no section of Klipper or Kalico: klippy needs its module; its pins exist, and nothing is at them"
+        "printer.cfg:65: [beacon] is no section of Klipper or Kalico: klippy needs its module; its pins exist, and nothing is at them"
     ), "{}", notes[0]);
 }
 
@@ -165,7 +165,7 @@ fn a_mistake_is_said_with_its_line_in_klippys_words() {
         (
             "[tmc2209 stepper_y]",
             "[tmc2209 stepper_q]",
-            "printer.cfg:35: Could not find config section '[stepper_q]' required by TMC driver: add it, or remove the driver",
+            "printer.cfg:34: Could not find config section '[stepper_q]' required by TMC driver: add it, or remove the driver",
         ),
         (
             "kinematics: cartesian",
