@@ -9,7 +9,7 @@ use crate::process::{Pinion, folder_with};
 fn output(args: &[&str]) -> (Option<i32>, String, String) {
     let done = crate::process::output(args);
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (done.status, text(&done.stdout), text(&done.stderr))
+    (done.status.code(), text(&done.stdout), text(&done.stderr))
 }
 
 /// A printer of two MCUs.

@@ -193,24 +193,6 @@ impl Host {
         }
     }
 
-    /// Restarts klippy and its MCUs. Its API is another one then.
-    pub(super) fn restart(&mut self) -> Result<(), Refused> {
-        self.send("gcode/firmware_restart", json!({}))?;
-        let until = Instant::now() + START;
-        let gone = |error: std::io::Error| Refused::Gone(error.to_string());
-        // klippy ends all connections when it restarts.
-        while !matches!(self.message(until), Err(Refused::Gone(_) | Refused::Late)) {}
-        self.api = loop {
-            match UnixStream::connect(&self.socket) {
-                Ok(api) => break api,
-                Err(error) if Instant::now() > until => return Err(gone(error)),
-                Err(_) => thread::sleep(Duration::from_millis(50)),
-            }
-        };
-        self.buffer.clear();
-        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
-    }
-
     /// klippy's state and its words about it.
     pub(super) fn state(&mut self) -> Result<(String, String), Refused> {
         let info = self.call("info", json!({}), ANSWER)?;
@@ -241,8 +223,9 @@ impl Host {
     }
 }
 
-impl Drop for Host {
-    fn drop(&mut self) {
+impl Host {
+    /// Ends klippy. One that hangs is killed.
+    pub(super) fn end(&mut self) {
         let pid = nix::unistd::Pid::from_raw(self.child.id().cast_signed());
         let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM);
         let until = Instant::now() + END_TIME;
@@ -254,5 +237,11 @@ impl Drop for Host {
         }
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        self.end();
     }
 }

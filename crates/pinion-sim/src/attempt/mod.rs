@@ -96,7 +96,7 @@ pub(crate) fn run(
             return false;
         }
     };
-    let mut trial = Trial { attempt, own, probe, host, objects: Vec::new(), broken: None };
+    let mut trial = Trial { attempt, folder, own, probe, host, objects: Vec::new(), broken: None };
     for step in STEPS {
         if ended.load(Ordering::SeqCst) {
             break;
@@ -145,6 +145,7 @@ const STEPS: &[Step] = &[
 
 struct Trial<'a> {
     attempt: &'a Attempt,
+    folder: &'a Folder,
     own: &'a Own,
     probe: &'a SimProbe,
     host: Host,
@@ -198,7 +199,7 @@ impl Trial<'_> {
             if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
                 return outcome;
             }
-            if self.host.restart().is_err()
+            if self.restart().is_err()
                 || self.until_ready().is_err()
                 || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err()
             {
@@ -206,6 +207,14 @@ impl Trial<'_> {
             }
         }
         (step.run)(self)
+    }
+
+    /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
+    fn restart(&mut self) -> Result<(), Trouble> {
+        self.host.end();
+        let Attempt { klipper, python, realtime, .. } = self.attempt;
+        self.host = Host::start(klipper, python, self.folder, *realtime)?;
+        Ok(())
     }
 
     /// After a failure: goes on if klippy is ready, or is so after a restart.
@@ -222,7 +231,7 @@ impl Trial<'_> {
         }
         if step != "ready"
             && step != "homed"
-            && self.host.restart().is_ok()
+            && self.restart().is_ok()
             && self.until_ready().is_ok()
             && self.host.gcode("G28", LONG).is_ok()
         {

@@ -41,6 +41,10 @@ impl Translator<'_> {
         let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
         let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
         part = part.set_if("select_pin", select);
+        // The motor's load suits the sensitivity that its owner found.
+        if let Some(sgt) = section.whole("driver_sgt", -64)?.filter(|_| kind != "tmc2660") {
+            part = part.set("sg_free", 200 - 10 * sgt.min(63));
+        }
         let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
         for key in diags {
             part = part.set_if(key, self.take(section, key)?);
@@ -66,6 +70,9 @@ impl Translator<'_> {
         if kind == "tmc2209" {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
             part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
+            if let Some(threshold) = section.whole("driver_sgthrs", 0)? {
+                part = part.set("sg_free", (2 * threshold.min(255) + 100).clamp(250, 511));
+            }
         }
         self.out.add("part", part);
         Ok(())

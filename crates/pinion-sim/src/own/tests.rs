@@ -46,6 +46,7 @@ position_max: 250
 uart_pin: PC11
 uart_address: 1
 diag_pin: ^PC12
+driver_SGTHRS: 130
 [mcu z]
 canbus_uuid: 11aabb
 [board_pins]
@@ -117,7 +118,7 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     let Translated { description, notes, .. } = translated(PRINTER).unwrap();
     let driver = named(&description, "part", "kind", "tmc2209");
     assert_eq!((driver["axis"].as_str(), driver["address"].as_integer()), (Some("y"), Some(1)));
-    assert_eq!(driver["diag_pin"].as_str(), Some("PC12"));
+    assert_eq!((driver["diag_pin"].as_str(), driver["sg_free"].as_integer()), (Some("PC12"), Some(360)));
     let probe = named(&description, "part", "kind", "probe");
     assert_eq!((probe["pin"].as_str(), probe["z_offset_mm"].as_float()), (Some("z:gpio9"), Some(1.5)));
     let hot = named(&description, "heater", "name", "extruder");
@@ -129,7 +130,7 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     assert_eq!(boards[0]["pins"].as_array().unwrap(), &["PD1".into()]);
     assert_eq!(notes.len(), 1);
     assert!(notes[0].to_string().ends_with(
-        "printer.cfg:69: [beacon] is no section of Klipper or Kalico: klippy needs its module; its pins exist, and nothing is at them"
+        "printer.cfg:65: [beacon] is no section of Klipper or Kalico: klippy needs its module; its pins exist, and nothing is at them"
     ), "{}", notes[0]);
 }
 
@@ -164,7 +165,7 @@ fn a_mistake_is_said_with_its_line_in_klippys_words() {
         (
             "[tmc2209 stepper_y]",
             "[tmc2209 stepper_q]",
-            "printer.cfg:35: Could not find config section '[stepper_q]' required by TMC driver: add it, or remove the driver",
+            "printer.cfg:34: Could not find config section '[stepper_q]' required by TMC driver: add it, or remove the driver",
         ),
         (
             "kinematics: cartesian",
