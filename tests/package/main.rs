@@ -119,12 +119,8 @@ fn run(options: &Options) -> Result<bool, String> {
     let share = folder.path().join("share");
     packages::share(&share)?;
     packages::share_klippy(&share)?;
-    let uses = |path: &str| checks.iter().any(|check| options.chosen(check) && check.script.contains(path));
-    if uses("/share/apt") {
+    if checks.iter().any(|check| options.chosen(check) && check.script.contains("/share/apt")) {
         packages::share_repositories(&share)?;
-    }
-    if uses("/share/image") {
-        packages::share_image(&share, &root.sources)?;
     }
     commands::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());

@@ -73,15 +73,6 @@ pub fn share_repositories(folder: &Path) -> Result<(), String> {
     )
 }
 
-/// The container image, made twice: the same packages give the same bytes. `sources` is a sources.list of Debian 12.
-pub fn share_image(folder: &Path, sources: &Path) -> Result<(), String> {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/image");
-    for name in ["image", "again"] {
-        process::run(Command::new(&script).arg(folder.join(name)).arg(folder.join("pinion-mcu.deb")).arg(sources))?;
-    }
-    process::pipeline(r#"cd "$1"; cmp image/*.tar again/*.tar; rm -r again"#, &[&folder.display().to_string()])
-}
-
 /// klippy from the checkout in KLIPPER_DIR, if it is set. It is for klippy's own checks: see `guest/klippy.sh`. klippy
 /// compiles its C library here, because this is also a Debian 12 for x86-64.
 pub fn share_klippy(folder: &Path) -> Result<(), String> {

@@ -15,13 +15,13 @@ in_root() { chroot root /usr/bin/env PATH=/usr/sbin:/usr/bin:/sbin:/bin "$@"; }
 
 # Pinion's dependencies wait in a folder of the VM, and its apt installs from there: the VM has no network. Only libiio
 # itself waits there. It needs ICU (by way of libxml2), and the emulated processor takes half a minute to install that.
-# The packages of Python are klippy's. sshd is for the link over SSH, podman for the container image.
+# The packages of Python are klippy's. sshd is for the link over SSH.
 mmdebstrap --quiet --mode=root --variant=minbase \
     --include=sudo,apt-utils \
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=libavahi-client3,libserialport0,libusb-1.0-0,libxml2 \
     --include=iproute2,python3-can,python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
-    --include=openssh-server,podman,crun \
+    --include=openssh-server \
     --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
     --dpkgopt='path-include=/usr/share/doc/pinion-mcu/*' --dpkgopt='path-exclude=/var/lib/dpkg/available' \
     --customize-hook='chroot "$1" apt-get clean' \
@@ -62,7 +62,7 @@ printf 'virtio_console\nconfigfs\n9pnet_virtio\n' >root/etc/modules-load.d/tests
 # It has no console that anybody logs in at, and nothing to tidy up. systemd reads all units at each daemon-reload,
 # which takes the emulated processor long. So units that no check and no page needs are removed.
 (cd root/usr/lib/systemd/system && rm -rf *getty* apt-daily* dpkg-db-backup* e2scrub* fstrim* emergency* initrd* \
-    podman* remote-* rescue* *binfmt* *cryptsetup* *integritysetup* *veritysetup* systemd-ask-password* systemd-firstboot* \
+    remote-* rescue* *binfmt* *cryptsetup* *integritysetup* *veritysetup* systemd-ask-password* systemd-firstboot* \
     systemd-fsck* systemd-initctl* systemd-pcrphase* systemd-pstore* systemd-repart* systemd-sysext* \
     systemd-udev-settle* systemd-update-utmp*)
 # It also starts these programs then. Nothing that they generate is needed.
@@ -70,7 +70,7 @@ mkdir root/etc/systemd/system-generators
 for generator in root/usr/lib/systemd/system-generators/*; do
     ln -s /dev/null "root/etc/systemd/system-generators/${generator##*/}"
 done
-truncate -s 1600M root.img
+truncate -s 1200M root.img
 mke2fs -q -t ext4 -O '^metadata_csum,^has_journal' -d root root.img
 
 # An initrd that finds the disk.

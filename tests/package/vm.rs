@@ -38,8 +38,6 @@ const TOOLS: [(&str, &str); 3] =
 pub struct Root {
     kernel: PathBuf,
     folder: PathBuf,
-    /// A sources.list of its Debian.
-    pub sources: PathBuf,
 }
 
 impl Root {
@@ -69,7 +67,7 @@ impl Root {
             )?;
             fs::rename(&partial, &folder).map_err(|error| format!("{}: {error}", folder.display()))?;
         }
-        Ok(Root { kernel: kernel.vmlinux, folder, sources: offers.sources() })
+        Ok(Root { kernel: kernel.vmlinux, folder })
     }
 }
 
