@@ -233,8 +233,8 @@ fn end(
     link.finish();
     let failure = match left {
         Ok(Left::Safe) => None,
-        Ok(Left::Owing(debtor)) => Some(
-            Trouble::new(format!("{debtor} cannot be driven to its shutdown value: the guardian tries that now"))
+        Ok(Left::Pending(output)) => Some(
+            Trouble::new(format!("{output} cannot be driven to its shutdown value: the guardian tries that now"))
                 .remedy("read its next line"),
         ),
         Err(_) => Some(Trouble::new("the core ended by a panic").remedy("please report it with the lines above")),

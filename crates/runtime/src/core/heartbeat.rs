@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Signs of life, in a page of memory that the program and the guardian share. The page has the core's heartbeat, and
-//! the guardian's own sign. It also has the shutdown values that the MCU owes, and each worker's present job.
+//! The heartbeats, in a page of memory that the program and the guardian share. The page has the core's heartbeat and
+//! the guardian's. It also has the pending shutdown values, and each worker's present job.
 //!
 //! A beat is the instant at which it was given. So a listener knows when silence began, and need not look more often
 //! than silence may last. The core sets that limit with each beat. It is about half a second while the MCU runs
 //! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Otherwise the outputs are at their start or shutdown values.
 //! Opening a device or ending a worker may then take its time.
 //!
-//! At a shutdown, workers write some of the outputs. Until they have done so, the MCU owes these shutdown values
-//! ([`Heartbeat::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
-//! core that hangs.
+//! At a shutdown, workers write some of the outputs. Until they have done so, these shutdown values are pending
+//! ([`Heartbeat::set_pending`]). Beats do not count meanwhile. After [`STOPPING`] the guardian takes over, as it does
+//! for a core that hangs.
 //!
-//! The guardian in turn leaves a sign each time it listens. With [`GuardianMonitor`] the program notices a guardian that is
-//! stopped or hangs.
+//! The guardian beats each time it listens. With [`GuardianMonitor`] the program notices a guardian that is stopped or
+//! hangs.
 
 #![forbid(unsafe_code)]
 

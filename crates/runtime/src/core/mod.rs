@@ -141,7 +141,7 @@ pub(crate) enum Left {
     /// At their shutdown values.
     Safe,
     /// This output is not at its shutdown value, as far as is known.
-    Owing(String),
+    Pending(String),
 }
 
 impl Core {
@@ -301,7 +301,7 @@ impl Core {
             self.heartbeat.beat(self.mcu.now(), false);
             thread::park_timeout(Duration::from_millis(1));
         }
-        let left = self.mcu.pending_value().map_or(Left::Safe, |pending| Left::Owing(pending.to_owned()));
+        let left = self.mcu.pending_value().map_or(Left::Safe, |pending| Left::Pending(pending.to_owned()));
         // This beat gives workers and devices time to end.
         self.heartbeat.beat(self.mcu.now(), false);
         left
@@ -880,7 +880,7 @@ mod tests {
 
     #[test]
     fn a_program_that_ends_waits_for_its_last_writes_and_says_what_failed() {
-        for (broken, left) in [(false, Left::Safe), (true, Left::Owing("digital output oid 1 (gpio30)".into()))] {
+        for (broken, left) in [(false, Left::Safe), (true, Left::Pending("digital output oid 1 (gpio30)".into()))] {
             let rig = Rig::new();
             if broken {
                 rig.bench.state().broken.insert(30);
