@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use pinion_testkit::markdown::{COMMANDS, Page, pages, reason};
 
 /// The allowed kinds of blocks.
-const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];
+const KINDS: [&str; 7] = [COMMANDS, "ini", "toml", "text", "diff", "rust", "yaml"];
 /// The pages for developers. Their commands are in indented blocks, and no test runs them.
 const FOR_DEVELOPERS: [&str; 2] = ["CONTRIBUTING.md", "docs/develop/"];
 

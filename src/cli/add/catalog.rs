@@ -486,8 +486,10 @@ mod tests {
                 let numbered = |chip: &Chip| line.strip_prefix(&format!("{}/gpio", chip.label))?.parse::<usize>().ok();
                 is_named || chips.iter().any(|chip| numbered(chip).is_some_and(|number| number < chip.lines.len()))
             };
-            // One of these trees has a Raspberry Pi 5 without its header.
-            if own.name != "Raspberry Pi 5" || chips.iter().any(|chip| chip.label == "pinctrl-rp1") {
+            // Some kernels of a Raspberry Pi 5 have no driver for its header, or no names for the header's lines.
+            let has_names =
+                |chip: &Chip| chip.label == "pinctrl-rp1" && chip.lines.iter().any(|line| line.name.is_some());
+            if own.name != "Raspberry Pi 5" || chips.iter().any(has_names) {
                 known += 1;
                 let missing: Vec<&String> = own.lines.values().filter(|line| !is_there(line)).collect();
                 assert!(missing.is_empty(), "{}: {missing:?}", own.name);

@@ -150,13 +150,13 @@ impl Job for Reading {
 /// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
-        "{SUBJECT} ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
+        "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
     )
 }
 
 /// For the log: nothing else counts a pin's edges, so it is polled.
 fn polled(name: &str, why: &str) -> String {
-    format!("{SUBJECT} ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
+    format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
 /// The kernel's edges, and the job that reads them.

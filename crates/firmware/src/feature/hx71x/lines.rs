@@ -156,7 +156,7 @@ impl Shift {
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
-        "{SUBJECT} ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
+        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
     )
 }
 
@@ -238,7 +238,7 @@ mod tests {
     use crate::board::Direction;
     use crate::time::NS_PER_TICK;
     use std::sync::Mutex;
-    use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+    use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
     use std::thread;
     use std::time::{Duration, Instant};
 
@@ -348,7 +348,11 @@ mod tests {
     }
 
     /// A clock with steps of 2 ms.
-    struct Coarse;
+    #[derive(Default)]
+    struct Coarse {
+        /// Until when a worker waited.
+        waited: AtomicU64,
+    }
 
     impl TimeSource for Coarse {
         fn now(&self) -> Clock {
@@ -363,6 +367,10 @@ mod tests {
             Duration::ZERO
         }
 
+        fn spin_until(&self, end: Clock) {
+            self.waited.store(end.since(Clock::EPOCH) as u64, Ordering::SeqCst);
+        }
+
         fn step_ns(&self) -> u32 {
             2_000_000
         }
@@ -371,10 +379,11 @@ mod tests {
     #[test]
     fn a_pulse_is_surely_long_enough_on_a_coarse_clock() {
         let (mut shift, ..) = workers(None, 1);
-        shift.time = Arc::new(Coarse);
-        let began = Instant::now();
+        let clock = Arc::new(Coarse::default());
+        shift.time = clock.clone();
         shift.wait();
-        assert!(began.elapsed() >= Duration::from_nanos(2_000_200), "200 ns may be none on this clock");
+        let waited_ns = clock.waited.load(Ordering::SeqCst) * NS_PER_TICK;
+        assert!(waited_ns >= 2_000_200, "200 ns may be none on this clock: {waited_ns}");
     }
 
     #[test]

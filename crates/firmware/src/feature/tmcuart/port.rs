@@ -77,7 +77,7 @@ impl Port {
             Ok(heard) => self.warn(heard, sent.get(1).copied().unwrap_or_default()),
             Err(trouble) => {
                 if !std::mem::replace(&mut self.failed, true) {
-                    let trouble = trouble.of(format_args!("{SUBJECT} {}", self.name));
+                    let trouble = trouble.of(format_args!("TMC UART {}", self.name));
                     self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
                 }
             }
@@ -153,7 +153,7 @@ impl Port {
                 )
             }
         };
-        let trouble = Trouble::new(text).of(format_args!("{SUBJECT} {}", self.name));
+        let trouble = Trouble::new(text).of(format_args!("TMC UART {}", self.name));
         self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
     }
 }
