@@ -113,6 +113,11 @@ impl State {
         }
     }
 
+    /// Nothing drives the line or the device any more, so no shutdown value is pending for it.
+    pub(super) fn drop_pending(&mut self, subject: Subject) {
+        self.pending.values.retain(|value| value.subject != subject);
+    }
+
     fn make_safe(&mut self, subject: Subject) {
         let oid = match subject {
             Subject::Object(oid) => oid,
