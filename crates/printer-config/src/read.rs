@@ -37,7 +37,7 @@ impl Config {
         let mut reader = Reader { files, config: Config::default(), within: Vec::new(), opened: 0, bytes: 0 };
         let text = reader.text(path)?;
         let (usual, saved) = match text.find(SAVED).map(|at| text.split_at(at)) {
-            Some((usual, block)) => match saved_lines(block) {
+            Some((usual, block)) => match saved_lines(&block[SAVED.len()..]) {
                 Some(lines) if !usual.contains("\n#*# ") => (usual, lines),
                 // klippy ignores a block that somebody edited.
                 _ => (text.as_str(), Vec::new()),
@@ -57,7 +57,8 @@ impl Config {
         let mut section = String::new();
         let mut is_set = false;
         let mut kept = Vec::new();
-        for (number, text) in (before + 2..).zip(lines) {
+        // The head of the block has three lines, after an empty one.
+        for (number, text) in (before + 5..).zip(lines) {
             let pruned = text.find(['#', ';']).map_or(*text, |at| &text[..at]).trim_end();
             if let Some(first) = pruned.chars().next().filter(|first| !first.is_whitespace()) {
                 is_set = false;
@@ -80,7 +81,7 @@ fn saved_lines(block: &str) -> Option<Vec<&str>> {
     let strip = |line: &'_ str| -> Option<usize> {
         (line.starts_with("#*#") && (line.len() < 4 || line.starts_with("#*# "))).then(|| line.len().min(4))
     };
-    block[1..].trim_end().lines().map(|line| strip(line).map(|mark| &line[mark..])).collect()
+    block.trim_end().lines().map(|line| strip(line).map(|mark| &line[mark..])).collect()
 }
 
 struct Reader<'a> {

@@ -45,15 +45,7 @@ pub(super) fn place_of(config: &Config, message: &str) -> Option<Place> {
     {
         return Some(found);
     }
-    // "Error evaluating 'gcode_macro START_PRINT:gcode'"
-    let named = |text: &&str| section(text.split(':').next().unwrap_or(text)).map(|found| found.place.clone());
-    if let Some(found) = texts.iter().find_map(named) {
-        return Some(found);
-    }
-    // "Unable to read tmc uart 'stepper_x' register", "Heater extruder not heating", "No trigger on x after full movement"
-    let is_about = |section: &&Section, word: &str| {
-        section.own_name() == Some(word) || section.name == word || section.name == format!("stepper_{word}")
-    };
+    // "Unable to read tmc uart 'stepper_x' register"
     let clean: Vec<&str> = words.iter().map(|word| word.trim_matches(['\'', '"', ',', '.', ':'])).collect();
     if lower.contains("tmc")
         && let Some(found) = config.sections().iter().find(|section| {
@@ -62,6 +54,15 @@ pub(super) fn place_of(config: &Config, message: &str) -> Option<Place> {
     {
         return Some(found.place.clone());
     }
+    // "Error evaluating 'gcode_macro START_PRINT:gcode'"
+    let named = |text: &&str| section(text.split(':').next().unwrap_or(text)).map(|found| found.place.clone());
+    if let Some(found) = texts.iter().find_map(named) {
+        return Some(found);
+    }
+    // "Heater extruder not heating", "No trigger on x after full movement"
+    let is_about = |section: &&Section, word: &str| {
+        section.own_name() == Some(word) || section.name == word || section.name == format!("stepper_{word}")
+    };
     if lower.contains("endstop") || lower.contains("trigger") {
         let found = config
             .sections()
