@@ -5,13 +5,12 @@
 
 use std::sync::Arc;
 
-use crate::board::Line;
+use crate::board::{Line, Pin};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
 use super::lines::{Claim, Level, Repeated};
 use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
-use crate::board::Pin;
 
 /// Reads an input of a chip that may sleep.
 struct Read;

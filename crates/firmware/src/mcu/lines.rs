@@ -18,6 +18,7 @@ use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line
 use crate::shutdown::{Shutdown, reason};
 
 use super::outputs::Output;
+use super::stop::Subject;
 use super::{Calls, Context, DeviceId, InputLine, LineState, OutputLine, PromptLine, Settable, State};
 
 /// The GPIO lines in use.
@@ -89,6 +90,11 @@ impl Claim {
 
     pub(super) fn output(&self) -> Option<&Output> {
         self.output.as_ref()
+    }
+
+    /// The level to which a stop of the MCU drives the line. `None` if a stop leaves it.
+    pub(super) fn value_at_stop(&self) -> Option<bool> {
+        self.shutdown_value().filter(|_| self.output.as_ref().is_some_and(Output::is_driven_at_stop))
     }
 
     /// The level of an output in a stopped MCU.
@@ -322,9 +328,8 @@ impl State {
             return self.enter(pin, ClaimedLine { line, sleeps_on }, direction, level, output);
         };
         let claim = &mut self.lines.claims[place];
-        let is_driven = |output: Option<&Output>| output.is_some_and(Output::is_driven_at_stop);
         // An output of an object keeps its shutdown value when something else drives the same line.
-        let kept = claim.shutdown_value().filter(|_| is_driven(claim.output.as_ref()) && !is_driven(output.as_ref()));
+        let kept = claim.value_at_stop().filter(|_| !output.as_ref().is_some_and(Output::is_driven_at_stop));
         let direction = match (direction, kept) {
             (Direction::Output { level, .. }, Some(shutdown_value)) => Direction::Output { level, shutdown_value },
             (direction, _) => direction,
@@ -334,6 +339,9 @@ impl State {
         claim.level.begin(direction);
         if kept.is_none() || claim.shutdown_value().is_none() {
             claim.output = output.map(|output| output.taking_over(claim.output.take()));
+        }
+        if claim.value_at_stop().is_none() {
+            self.drop_pending(Subject::Output(place));
         }
         Ok(place)
     }

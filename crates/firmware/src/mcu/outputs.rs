@@ -168,11 +168,7 @@ impl State {
     /// Drives an output to its shutdown value, unless it keeps its level.
     pub(super) fn make_output_safe(&mut self, place: usize) {
         let Some(claim) = self.lines.get(place) else { return };
-        let is_driven = claim.output().is_some_and(Output::is_driven_at_stop);
-        let Some(value) = claim.shutdown_value().filter(|_| is_driven) else {
-            // It may have been an output, and be an input now.
-            return self.drop_pending(Subject::Output(place));
-        };
+        let Some(value) = claim.value_at_stop() else { return };
         let safe = match claim.slow() {
             None => claim.write(value).map(|()| Safe::Now),
             Some(_) => self.write_output(place, value).map(|()| Safe::Later),

@@ -113,7 +113,8 @@ impl State {
         }
     }
 
-    /// Nothing drives the line or the device any more, so no shutdown value is pending for it.
+    /// Nothing drives the output any more, for example because its line is an input now. So no shutdown value is pending
+    /// for it.
     pub(super) fn drop_pending(&mut self, subject: Subject) {
         self.pending.values.retain(|value| value.subject != subject);
     }

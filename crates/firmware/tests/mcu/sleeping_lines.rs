@@ -144,6 +144,25 @@ fn a_chip_that_fails_stops_the_mcu_and_is_tried_until_it_answers() {
     assert_eq!(notes.last().unwrap(), "safe: digital output oid 0 (gpio50)");
 }
 
+/// The last setup decides: nothing drives an input. A value that stays pending would keep a config_reset waiting.
+#[test]
+fn a_line_that_becomes_an_input_has_no_pending_value() {
+    for hangs in [false, true] {
+        let mut rig = rig(&[FAN, "config_buttons oid=3 button_count=1"]);
+        if hangs {
+            rig.bench.state().answer_ticks = 600_000_000;
+        } else {
+            rig.bench.state().broken.insert(PIN);
+        }
+        rig.send("emergency_stop");
+        rig.run_until(1_000_000);
+        assert_eq!(rig.mcu.pending_value(), Some("digital output oid 0 (gpio50)"), "hangs: {hangs}");
+        rig.bench.state().broken.clear();
+        rig.send_all(&["clear_shutdown", "buttons_add oid=3 pos=0 pin=50 pull_up=0"]);
+        assert_eq!(rig.mcu.pending_value(), None, "hangs: {hangs}");
+    }
+}
+
 /// 100 ms in ticks.
 const UNREAD_LIMIT: u64 = 5_000_000;
 
