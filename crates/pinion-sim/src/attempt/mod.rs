@@ -143,6 +143,11 @@ const STEPS: &[Step] = &[
     Step { name: "cooled", run: |trial| trial.cooled() },
 ];
 
+/// Whether a step comes before anything is homed.
+fn is_first(step: &str) -> bool {
+    ["ready", "homed"].contains(&step)
+}
+
 struct Trial<'a> {
     attempt: &'a Attempt,
     folder: &'a Folder,
@@ -199,10 +204,7 @@ impl Trial<'_> {
             if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
                 return outcome;
             }
-            if self.restart().is_err()
-                || self.until_ready().is_err()
-                || !["ready", "homed"].contains(&step.name) && self.host.gcode("G28", LONG).is_err()
-            {
+            if !self.begins_again(step.name) {
                 return outcome;
             }
         }
@@ -229,15 +231,14 @@ impl Trial<'_> {
             }
             return;
         }
-        if step != "ready"
-            && step != "homed"
-            && self.restart().is_ok()
-            && self.until_ready().is_ok()
-            && self.host.gcode("G28", LONG).is_ok()
-        {
-            return;
+        if is_first(step) || !self.begins_again(step) {
+            self.broken = Some("klippy is not ready".into());
         }
-        self.broken = Some("klippy is not ready".into());
+    }
+
+    /// Starts another klippy, and homes unless a step does that itself. Returns whether this worked.
+    fn begins_again(&mut self, step: &str) -> bool {
+        self.restart().is_ok() && self.until_ready().is_ok() && (is_first(step) || self.host.gcode("G28", LONG).is_ok())
     }
 
     /// Waits until klippy is ready. The error is its words.
@@ -298,7 +299,7 @@ impl Trial<'_> {
     }
 
     fn homed(&mut self) -> Outcome {
-        if self.own.config.section("printer").and_then(|printer| printer.text("kinematics")) == Some("none") {
+        if self.kinematics() == Some("none") {
             return Outcome::Skipped("kinematics: none".into());
         }
         let before = self.lost();
@@ -323,7 +324,7 @@ impl Trial<'_> {
         let off = position.iter().zip(nozzle).map(|(klippys, real)| (klippys - real).abs());
         let off: Vec<f64> = off.collect();
         let [x, y, z] = nozzle;
-        let far = off.iter().zip(["x", "y", "z"]).find(|(off, _)| **off > NEAR_MM + 0.5 * f64::from(**off > 1e9));
+        let far = off.iter().zip(["x", "y", "z"]).find(|(off, _)| **off > NEAR_MM);
         if let Some((off, axis)) = far.filter(|_| self.is_plain()) {
             let place =
                 self.own.config.section(&format!("stepper_{axis}")).map(|s| s.place_of("position_endstop").clone());
@@ -332,13 +333,16 @@ impl Trial<'_> {
         Outcome::Passed(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
     }
 
+    fn kinematics(&self) -> Option<&str> {
+        self.own.config.section("printer")?.text("kinematics")
+    }
+
     /// Whether klippy's position is the nozzle's: nothing is between them, and the bed does not change it.
     fn is_plain(&self) -> bool {
         let sections = ["bed_tilt", "skew_correction", "axis_twist_compensation", "z_tilt", "quad_gantry_level"];
-        let kinematics = self.own.config.section("printer").and_then(|printer| printer.text("kinematics"));
         let simple = ["cartesian", "corexy", "corexz", "delta", "hybrid_corexy", "hybrid_corexz"];
         !sections.iter().any(|name| self.own.config.section(name).is_some())
-            && kinematics.is_some_and(|kinematics| simple.contains(&kinematics))
+            && self.kinematics().is_some_and(|kinematics| simple.contains(&kinematics))
     }
 
     /// The heaters with klippy's name and a usual temperature of theirs.

@@ -94,8 +94,7 @@ pub(super) fn place_of(config: &Config, message: &str) -> Option<Place> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_printer_config::Disk;
-    use pinion_printer_config::Files;
+    use pinion_printer_config::{Disk, Files};
 
     struct One(&'static str);
     impl Files for One {

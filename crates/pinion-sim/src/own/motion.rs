@@ -25,6 +25,14 @@ struct Rail {
     at_max: bool,
 }
 
+impl Rail {
+    /// A place in front of the endstop.
+    fn before_endstop(&self) -> f64 {
+        let room = BEFORE_ENDSTOP_MM.min((self.max - self.min) / 3.0);
+        if self.at_max { self.endstop - room } else { self.endstop + room }
+    }
+}
+
 /// What an endstop's pin is.
 enum Endstop {
     /// A switch at a pin of an MCU.
@@ -176,19 +184,33 @@ impl<'a> Translator<'a> {
         }
     }
 
+    /// The section of a motor that the kinematics need.
+    fn stepper(&self, axis: &str) -> Result<&'a Section, Trouble> {
+        let config = self.config;
+        config.section(&format!("stepper_{axis}")).ok_or_else(|| {
+            let cause = format!("Option 'step_pin' in section 'stepper_{axis}' must be specified");
+            Trouble::new(cause).remedy(format!("add [stepper_{axis}]"))
+        })
+    }
+
+    /// An axis whose endstop is at its highest place.
+    fn axis_below(&mut self, name: &str, section: &Section, min: f64, highest: f64, start: f64) -> Result<(), Trouble> {
+        let entry = self.motor(section, name)?;
+        let endstop = self.endstop(section)?;
+        let rail = Rail { min, max: highest, endstop: highest, at_max: true };
+        self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, start));
+        Ok(())
+    }
+
     /// An axis of a cartesian printer, with all of its motors.
     fn rail(&mut self, axis: &str) -> Result<(), Trouble> {
-        let Some(section) = self.config.section(&format!("stepper_{axis}")) else {
-            let cause = format!("Option 'step_pin' in section 'stepper_{axis}' must be specified");
-            return Err(Trouble::new(cause).remedy(format!("add [stepper_{axis}]")));
-        };
+        let section = self.stepper(axis)?;
         let rail = self.travel(section)?;
         let entry = self.motor(section, axis)?;
         let endstop = self.endstop(section)?;
         let start = match (axis, rail.at_max) {
             ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
-            (_, true) => rail.endstop - BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0),
-            (_, false) => rail.endstop + BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0),
+            _ => rail.before_endstop(),
         };
         let others: Vec<&Section> =
             (1..100).map_while(|n| self.config.section(&format!("stepper_{axis}{n}"))).collect();
@@ -237,9 +259,7 @@ impl<'a> Translator<'a> {
         let rail = self.travel(section)?;
         let entry = self.motor(section, "dual_carriage")?;
         let endstop = self.endstop(section)?;
-        let room = BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0);
-        let start = if rail.at_max { rail.endstop - room } else { rail.endstop + room };
-        let entry = Translator::with_rail(entry, &rail, &endstop, start);
+        let entry = Translator::with_rail(entry, &rail, &endstop, rail.before_endstop());
         let entry = if section.text("axis") == Some("y") { entry.set("along", "y") } else { entry };
         self.out.add("axis", entry);
         Ok(())
@@ -255,11 +275,9 @@ impl<'a> Translator<'a> {
             let along = section.text("axis").unwrap_or(primary);
             let rail = self.travel(section)?;
             let endstop = self.endstop(section)?;
-            let room = BEFORE_ENDSTOP_MM.min((rail.max - rail.min) / 3.0);
             let start = match (along, rail.at_max) {
                 ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
-                (_, true) => rail.endstop - room,
-                (_, false) => rail.endstop + room,
+                _ => rail.before_endstop(),
             };
             let entry = Entry::default().set("name", name).set("along", along);
             self.out.add("carriage", Translator::with_rail(entry, &rail, &endstop, start));
@@ -286,14 +304,7 @@ impl<'a> Translator<'a> {
 
     /// The three sections of a delta printer.
     fn towers(&self) -> Result<[&'a Section; 3], Trouble> {
-        let config = self.config;
-        let tower = |name: &str| {
-            config.section(&format!("stepper_{name}")).ok_or_else(|| {
-                let cause = format!("Option 'step_pin' in section 'stepper_{name}' must be specified");
-                Trouble::new(cause).remedy(format!("add [stepper_{name}]"))
-            })
-        };
-        Ok([tower("a")?, tower("b")?, tower("c")?])
+        Ok([self.stepper("a")?, self.stepper("b")?, self.stepper("c")?])
     }
 
     /// An option of three towers. The first one's value is the default of the others.
@@ -322,10 +333,7 @@ impl<'a> Translator<'a> {
         let angles = Translator::angles(towers, [210.0, 330.0, 90.0])?;
         for (n, (name, section)) in ["a", "b", "c"].into_iter().zip(towers).enumerate() {
             let highest = endstops[n] + (arms[n] * arms[n] - radius * radius).max(0.0).sqrt();
-            let entry = self.motor(section, name)?;
-            let endstop = self.endstop(section)?;
-            let rail = Rail { min: 0.0, max: highest, endstop: highest, at_max: true };
-            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, highest - BEFORE_ENDSTOP_MM));
+            self.axis_below(name, section, 0.0, highest, highest - BEFORE_ENDSTOP_MM)?;
         }
         let entry = Entry::default()
             .set("kind", "delta")
@@ -338,13 +346,7 @@ impl<'a> Translator<'a> {
     }
 
     fn deltesian(&mut self) -> Result<(), Trouble> {
-        let missing = |name: &str| {
-            let cause = format!("Option 'step_pin' in section '{name}' must be specified");
-            Trouble::new(cause).remedy(format!("add [{name}]"))
-        };
-        let config = self.config;
-        let side = |name: &str| config.section(name).ok_or_else(|| missing(name));
-        let sides = [side("stepper_left")?, side("stepper_right")?];
+        let sides = [self.stepper("left")?, self.stepper("right")?];
         let of = |key: &str| {
             sides[0].required(key)?;
             let left = sides[0].number(key, Limit::Any)?.unwrap_or(1.0);
@@ -353,10 +355,7 @@ impl<'a> Translator<'a> {
         let (arms, arm_x, endstops) = (of("arm_length")?, of("arm_x_length")?, of("position_endstop")?);
         for (n, (name, section)) in ["left", "right"].into_iter().zip(sides).enumerate() {
             let highest = endstops[n] + (arms[n] * arms[n] - arm_x[n] * arm_x[n]).max(0.0).sqrt();
-            let entry = self.motor(section, name)?;
-            let endstop = self.endstop(section)?;
-            let rail = Rail { min: 0.0, max: highest, endstop: highest, at_max: true };
-            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, highest - BEFORE_ENDSTOP_MM));
+            self.axis_below(name, section, 0.0, highest, highest - BEFORE_ENDSTOP_MM)?;
         }
         self.rail("y")?;
         let entry = Entry::default().set("kind", "deltesian").numbers("arms_mm", arms).numbers("arm_x_mm", arm_x);
@@ -365,17 +364,9 @@ impl<'a> Translator<'a> {
     }
 
     fn polar(&mut self) -> Result<(), Trouble> {
-        let config = self.config;
-        let section = |name: &str| {
-            config.section(name).ok_or_else(|| {
-                let cause = format!("Option 'step_pin' in section '{name}' must be specified");
-                Trouble::new(cause).remedy(format!("add [{name}]"))
-            })
-        };
-        let bed = section("stepper_bed")?;
-        let entry = self.motor(bed, "bed")?;
+        let entry = self.motor(self.stepper("bed")?, "bed")?;
         self.out.add("axis", entry);
-        let arm = section("stepper_arm")?;
+        let arm = self.stepper("arm")?;
         let rail = self.travel(arm)?;
         let entry = self.motor(arm, "arm")?;
         let endstop = self.endstop(arm)?;
@@ -404,10 +395,7 @@ impl<'a> Translator<'a> {
             let distance = radius.hypot(h);
             let share = (l * l - distance * distance - u * u) / (2.0 * u * distance);
             let angle = h.atan2(radius) - share.clamp(-1.0, 1.0).acos();
-            let entry = self.motor(section, name)?;
-            let endstop = self.endstop(section)?;
-            let rail = Rail { min: angle - 2.0, max: angle, endstop: angle, at_max: true };
-            self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, angle - 0.1));
+            self.axis_below(name, section, angle - 2.0, angle, angle - 0.1)?;
         }
         let entry = Entry::default().set("kind", "rotary_delta").set("shoulder_radius_mm", radius);
         let entry = entry.set("shoulder_height_mm", height).numbers("upper_arms_mm", upper);
