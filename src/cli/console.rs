@@ -17,8 +17,6 @@ use std::time::Duration;
 use clap::Args;
 use log::LevelFilter;
 use nix::fcntl::OFlag;
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::getpid;
 use rustyline::completion::Completer;
 use rustyline::config::CompletionType;
 use rustyline::error::ReadlineError;
@@ -46,7 +44,7 @@ use super::page::{Page, print};
 use super::settings::BoardName;
 use super::simulator::Open;
 use super::terminal::{Terminal, give_back_at, off};
-use super::{failed, logging, not_permitted};
+use super::{end, failed, logging, not_permitted};
 
 /// Longest wait for an answer of the MCU.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
@@ -186,10 +184,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
                     return;
                 }
                 *said.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
-                // SIGTERM to ourselves: the MCU ends in order.
-                if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-                    log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
-                }
+                end();
             });
             if let Err(trouble) = pinion_runtime::started(speaking) {
                 log::error!("the console cannot be started: {trouble}");

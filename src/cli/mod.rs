@@ -11,6 +11,8 @@ use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueHint};
 use log::LevelFilter;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::getpid;
 
 use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
@@ -206,6 +208,13 @@ fn not_permitted(link: &Path, file: &Path) -> String {
         None => "use sudo".to_owned(),
     };
     format!("{} may not be opened by this user: {remedy}", link.display())
+}
+
+/// Ends this program in order, as by Ctrl-C: SIGTERM to ourselves.
+pub fn end() {
+    if let Err(error) = kill(getpid(), Signal::SIGTERM) {
+        log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
+    }
 }
 
 /// Logs why a subcommand failed, and returns its exit status.

@@ -9,9 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::getpid;
-
+use pinion::cli::end;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
@@ -24,13 +22,17 @@ const START: Duration = Duration::from_secs(10);
 
 /// The paths of the links: the first board's, and behind its name those of the others.
 pub(crate) fn links(first: &Path, config: &SimConfig) -> Vec<PathBuf> {
+    links_of(first, config.mcus.iter().map(|mcu| mcu.name.as_str()))
+}
+
+/// The same for boards with these names.
+pub(crate) fn links_of<'a>(first: &Path, names: impl Iterator<Item = &'a str>) -> Vec<PathBuf> {
     let beside = |name: &str| {
         let mut path = first.as_os_str().to_owned();
         path.push(format!("_{name}"));
         PathBuf::from(path)
     };
-    let others = config.mcus.iter().skip(1).map(|mcu| beside(&mcu.name));
-    std::iter::once(first.to_owned()).chain(others).collect()
+    std::iter::once(first.to_owned()).chain(names.skip(1).map(beside)).collect()
 }
 
 /// What each board needs before the program has threads.
@@ -77,7 +79,7 @@ impl Others {
                 if let Err(trouble) = &ended {
                     log::error!("{trouble}");
                 }
-                end_all();
+                end();
                 ended
             };
             threads.push(pinion_runtime::started(thread::Builder::new().name(name).spawn(serve))?);
@@ -95,17 +97,11 @@ impl Others {
     /// Ends them, and says whether all ended in order. The first board has ended.
     pub(crate) fn end(self) -> bool {
         if !self.0.is_empty() {
-            end_all();
+            end();
         }
-        let ends: Vec<bool> = self.0.into_iter().map(|thread| matches!(thread.join(), Ok(Ok(())))).collect();
-        ends.into_iter().all(|right| right)
-    }
-}
-
-/// SIGTERM to ourselves: each board ends in order, as by Ctrl-C.
-fn end_all() {
-    if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-        log::error!("the other boards cannot be ended: {error}: press Ctrl-C");
+        // All are joined, also after one that failed.
+        let failed = self.0.into_iter().map(JoinHandle::join).filter(|ended| !matches!(ended, Ok(Ok(()))));
+        failed.count() == 0
     }
 }
 

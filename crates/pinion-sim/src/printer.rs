@@ -13,8 +13,6 @@ use std::thread;
 use std::time::Duration;
 
 use clap::Args;
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::demo::heater::Goal;
@@ -39,7 +37,7 @@ use crate::show::Show;
 use crate::toolpath::{Files, PathArgs, PathRecord};
 use pinion::cli::files::Output;
 use pinion::cli::page::{Page, print};
-use pinion::cli::{failed, logging};
+use pinion::cli::{end, failed, logging};
 
 /// Options of `pinion-sim`.
 #[derive(Args, Clone, Debug)]
@@ -140,7 +138,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     let links = match &owner {
-        Some(owner) => owner.place.links(&owner.own, args.symlink.as_deref()),
+        Some(owner) => owner.place.links().to_vec(),
         None => boards::links(args.symlink.as_deref().unwrap_or(Path::new(LINK)), &config),
     };
     let symlink = links[0].clone();
@@ -194,13 +192,11 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         return if others.end() { served } else { ExitCode::FAILURE };
     }
     let right = Arc::new(AtomicBool::new(false));
-    // Set when the program is asked to end. A demonstration that this interrupts has not failed.
-    let ended = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM] {
-        if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
-            return failed(format!("signals cannot be taken in: {error}"));
-        }
-    }
+    // A demonstration that this interrupts has not failed.
+    let ended = match asked_to_end() {
+        Ok(ended) => ended,
+        Err(error) => return failed(error),
+    };
     let ready = {
         let (args, right, symlink) = (args.clone(), right.clone(), symlink.clone());
         move || {
@@ -220,6 +216,16 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }
+}
+
+/// A flag that is set when the program is asked to end.
+fn asked_to_end() -> Result<Arc<AtomicBool>, String> {
+    let asked = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        signal_hook::flag::register(signal, asked.clone())
+            .map_err(|error| format!("signals cannot be taken in: {error}"))?;
+    }
+    Ok(asked)
 }
 
 /// The files of the options, checked before the printer starts.
@@ -294,12 +300,10 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
         owner.place.next(&args.own).iter().for_each(tell);
         return;
     };
-    let ended = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM] {
-        if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
-            log::error!("signals cannot be taken in: {error}");
-        }
-    }
+    let ended = asked_to_end().unwrap_or_else(|error| {
+        log::error!("{error}");
+        Arc::default()
+    });
     let (owner, probe, right, attempt) = (owner.clone(), probe.clone(), right.clone(), attempt.clone());
     let thread = thread::Builder::new().name("try".into()).spawn(move || {
         // The link's thread starts it, and passes its real-time priority on.
@@ -312,13 +316,6 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
     });
     if let Err(trouble) = pinion_runtime::started(thread) {
         log::error!("the printer cannot be tried: {trouble}");
-    }
-}
-
-/// Ends this program in order, as by Ctrl-C.
-fn end() {
-    if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-        log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
     }
 }
 

@@ -9,11 +9,10 @@ use std::path::{Path, PathBuf};
 
 use pinion_linux::foreign::plain;
 use pinion_printer_config::Trouble;
-use pinion_printer_config::pins::MAIN;
 use toml::Table;
 
 use super::args::OwnArgs;
-use super::serve::{Folder, Own};
+use super::serve::{Folder, Own, section_of};
 use crate::description::text;
 
 /// Whether a file is klippy's configuration, and no description.
@@ -58,24 +57,14 @@ impl Place {
         if args.in_place_pty {
             return own.mcus.iter().map(|mcu| in_place(own, mcu)).collect::<Result<_, _>>().map(Place::InPlace);
         }
-        let place = |folder: &Path, mcu: &str| match (mcu, link) {
-            (MAIN, Some(link)) => link.to_owned(),
-            (MAIN, None) => folder.join(MAIN),
-            (mcu, Some(link)) => beside(link, mcu),
-            (mcu, None) => beside(&folder.join(MAIN), mcu),
-        };
-        Folder::make(own, args.folder.as_deref(), place).map(Place::Folder)
+        Folder::make(own, args.folder.as_deref(), link).map(Place::Folder)
     }
 
     /// The links of all MCUs, the main one's first.
-    pub(crate) fn links(&self, own: &Own, link: Option<&Path>) -> Vec<PathBuf> {
+    pub(crate) fn links(&self) -> &[PathBuf] {
         match self {
-            Place::InPlace(links) => links.clone(),
-            Place::Folder(folder) => {
-                let main = link.map_or_else(|| folder.path.join(MAIN), Path::to_owned);
-                let of = |mcu: &String| if mcu == MAIN { main.clone() } else { beside(&main, mcu) };
-                own.mcus.iter().map(of).collect()
-            }
+            Place::InPlace(links) => links,
+            Place::Folder(folder) => &folder.links,
         }
     }
 
@@ -94,17 +83,9 @@ impl Place {
     }
 }
 
-/// The link of another MCU, beside the main one's.
-fn beside(main: &Path, mcu: &str) -> PathBuf {
-    let mut name = main.as_os_str().to_owned();
-    name.push("_");
-    name.push(mcu);
-    name.into()
-}
-
 /// The path where klippy expects an MCU.
 fn in_place(own: &Own, mcu: &str) -> Result<PathBuf, Trouble> {
-    let name = if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") };
+    let name = section_of(mcu);
     let section = own.config.section(&name).ok_or_else(|| Trouble::new(format!("there is no [{name}]")))?;
     let path = PathBuf::from(section.required("serial")?);
     let refused = |cause: &str| {

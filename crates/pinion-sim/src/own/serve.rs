@@ -10,11 +10,13 @@ use std::path::{Path, PathBuf};
 
 use pinion_linux::foreign::{self, word};
 use pinion_printer_config::copy::{self, Change};
+use pinion_printer_config::pins::MAIN;
 use pinion_printer_config::{Config, Trouble};
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
 use super::translate::{Pace, Translated, translate};
+use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
 const WAYS: [&str; 5] = ["serial", "canbus_uuid", "canbus_interface", "baud", "restart_method"];
@@ -81,19 +83,22 @@ pub(crate) struct Folder {
     pub(crate) path: PathBuf,
     /// The copy of printer.cfg.
     pub(crate) printer_cfg: PathBuf,
+    /// The links of all MCUs, the main one's first.
+    pub(super) links: Vec<PathBuf>,
+}
+
+/// The section of an MCU.
+pub(super) fn section_of(mcu: &str) -> String {
+    if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") }
 }
 
 impl Folder {
-    /// Makes the folder and the copy. `link` is the way to an MCU.
+    /// Makes the folder and the copy. `link` is the main MCU's link, if it is not in the folder.
     ///
     /// # Errors
     ///
     /// It cannot be written, or has files of somebody else.
-    pub(crate) fn make(
-        own: &Own,
-        named: Option<&Path>,
-        link: impl Fn(&Path, &str) -> PathBuf,
-    ) -> Result<Folder, Trouble> {
+    pub(super) fn make(own: &Own, named: Option<&Path>, link: Option<&Path>) -> Result<Folder, Trouble> {
         let path = match named {
             Some(named) => new_or_ours(named)?,
             None => nix::unistd::mkdtemp("/tmp/pinion-sim-XXXXXX").map_err(|error| {
@@ -106,16 +111,14 @@ impl Folder {
         };
         fs::create_dir_all(&gcodes).map_err(|error| failed(&gcodes, error))?;
         fs::write(path.join(MARK), "").map_err(|error| failed(&path, error))?;
-        let mut changes = Vec::new();
-        for mcu in &own.mcus {
-            let section = if mcu == pinion_printer_config::pins::MAIN { mcu.clone() } else { format!("mcu {mcu}") };
-            let serial = link(&path, mcu).display().to_string();
-            changes.push(Change {
-                section,
-                without: WAYS.map(str::to_owned).to_vec(),
-                with: vec![("serial".into(), serial), ("restart_method".into(), "command".into())],
-            });
-        }
+        let main = link.map_or_else(|| path.join(MAIN), Path::to_owned);
+        let links = links_of(&main, own.mcus.iter().map(String::as_str));
+        let served = |(mcu, link): (&String, &PathBuf)| Change {
+            section: section_of(mcu),
+            without: WAYS.map(str::to_owned).to_vec(),
+            with: vec![("serial".into(), link.display().to_string()), ("restart_method".into(), "command".into())],
+        };
+        let mut changes: Vec<Change> = own.mcus.iter().zip(&links).map(served).collect();
         let elsewhere = |section: &str, key: &str, value: &Path| Change {
             section: section.into(),
             without: vec![key.into()],
@@ -131,7 +134,7 @@ impl Folder {
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
-        Ok(Folder { path, printer_cfg })
+        Ok(Folder { path, printer_cfg, links })
     }
 
     /// The command that starts klippy on the copy.
