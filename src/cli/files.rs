@@ -206,7 +206,7 @@ mod tests {
         assert!(Output::check(&folder.path().join("b"), &[&path]).is_ok());
     }
 
-    /// What another user may do in /tmp, and in a folder of their own, between the check and the write.
+    /// Another user may do this in /tmp, and in a folder of their own, between the check and the write.
     #[test]
     fn a_file_that_was_checked_stays_where_it_was() {
         let root = tempfile::tempdir().unwrap();

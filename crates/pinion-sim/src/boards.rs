@@ -35,7 +35,7 @@ pub(crate) fn links_of<'a>(first: &Path, names: impl Iterator<Item = &'a str>) -
     std::iter::once(first.to_owned()).chain(names.skip(1).map(beside)).collect()
 }
 
-/// What each board needs before the program has threads.
+/// The helper processes of a board, which start before the program has threads.
 pub(crate) type Started = (PathBuf, Recording, Helpers);
 
 /// Starts the helper processes of each board. Call it before any thread starts.

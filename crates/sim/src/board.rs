@@ -200,7 +200,7 @@ impl SimWorld {
     }
 }
 
-/// What is connected to the boards.
+/// The parts that are connected to the boards.
 struct Parts {
     pins: Vec<WiredPin>,
     i2c_buses: Vec<Arc<I2cBus>>,

@@ -12,7 +12,7 @@ use super::stop::Subject;
 use super::{DeviceWarning, Note};
 use super::{Dialect, Generations, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 
-/// What a feature may do in a call. The timers and jobs that an object starts here are its own.
+/// The operations that a feature may use in a call. The timers and jobs that an object starts here are its own.
 ///
 /// `config_` commands also claim lines, open devices and create objects ([`Context::assign`]). The MCU refuses this
 /// after `finalize_config`.

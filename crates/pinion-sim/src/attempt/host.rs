@@ -31,7 +31,7 @@ const LOOK: Duration = Duration::from_secs(5);
 /// How long klippy has to end in order.
 const END_TIME: Duration = Duration::from_secs(3);
 
-/// What became of a command.
+/// The result of a command.
 #[derive(Debug)]
 pub(super) enum Refused {
     /// klippy refused it, in its words.
@@ -51,7 +51,7 @@ pub(super) struct Host {
     next_id: u64,
     /// Answers to other questions than the one that is waited for.
     answers: HashMap<u64, Value>,
-    /// What klippy said since the last command.
+    /// klippy's output since the last command.
     pub(super) said: Vec<String>,
 }
 

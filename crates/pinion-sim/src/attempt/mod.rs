@@ -62,7 +62,7 @@ const BUSY: [&str; 5] = [
 /// How often a step is repeated because of them.
 const TRIES: u32 = 4;
 
-/// What is tried, and how.
+/// The options of `--try`.
 #[derive(Clone, Debug)]
 pub(crate) struct Attempt {
     pub(crate) klipper: PathBuf,
@@ -398,7 +398,7 @@ impl Trial<'_> {
             }
             thread::sleep(Duration::from_millis(500));
         }
-        // What klippy reads is what is there.
+        // klippy's reading has to be the heater's temperature.
         let status = self.host.query(&objects).unwrap_or_default();
         for (name, _) in &targets {
             let own = name.rsplit(' ').next().unwrap_or(name);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What `--try` found: one line for each thing that it tried, then a verdict.
+//! The report of `--try`: one line for each step, then a verdict.
 
 #![forbid(unsafe_code)]
 

@@ -62,7 +62,7 @@ impl OwnArgs {
         self.klipper.as_deref()
     }
 
-    /// What to try.
+    /// The options of `--try`, if it is given.
     ///
     /// # Errors
     ///

@@ -13,7 +13,7 @@ use super::translate::{Pace, Translator};
 const AMBIENT_CELSIUS: f64 = 25.0;
 /// Full power could heat this much above the highest permitted temperature, as a share of it.
 const RESERVE: f64 = 1.3;
-/// What the mass of a heater stores. Only its ratio to the power counts.
+/// Heat that a heater's mass stores. Only its ratio to the power counts.
 const J_PER_K: f64 = 15.0;
 /// klippy's PID parameters are for a power of 0 to this.
 const PID_BASE: f64 = 255.0;

@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-/// What a section is here.
+/// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     /// Simulated, or it needs no hardware.
@@ -148,7 +148,7 @@ const KNOWN: &[&str] = &[
     "z_tilt_ng",
 ];
 
-/// What the sections with this first word are.
+/// The meaning of sections with this first word.
 pub(super) fn kind_of(word: &str) -> Kind {
     let is_numbered = |prefix: &str| {
         word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))

@@ -33,7 +33,7 @@ impl Rail {
     }
 }
 
-/// What an endstop's pin is.
+/// The kind of an endstop's pin.
 enum Endstop {
     /// A switch at a pin of an MCU.
     Switch(String),
@@ -123,7 +123,7 @@ impl<'a> Translator<'a> {
         Ok(entry.set_if("enable_pin", self.take_enable(section, "enable_pin")?))
     }
 
-    /// What is at a rail's `endstop_pin`.
+    /// The endstop at a rail's `endstop_pin`.
     fn endstop(&mut self, section: &Section) -> Result<Endstop, Trouble> {
         let Some(pin) = self.pin(section, "endstop_pin")? else { return Ok(Endstop::Other) };
         if pin.chip.starts_with("tmc") {

@@ -68,7 +68,7 @@ impl Place {
         }
     }
 
-    /// What the user does next.
+    /// The user's next step, as lines.
     pub(crate) fn next(&self, args: &OwnArgs) -> Vec<String> {
         match self {
             Place::Folder(folder) => vec![

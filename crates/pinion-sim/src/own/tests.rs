@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What becomes of the sections of a printer.cfg.
+//! The meaning of each section of a printer.cfg.
 
 use std::fs;
 

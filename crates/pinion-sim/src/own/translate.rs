@@ -31,7 +31,7 @@ pub(crate) struct Translated {
     pub(crate) description: Table,
     /// The MCUs in the order of the description, the main one first.
     pub(crate) mcus: Vec<String>,
-    /// What a user should know: sections that stand for nothing here, and what klippy will refuse.
+    /// Notes for the user: sections that are not simulated, and sections that klippy will refuse.
     pub(crate) notes: Vec<Trouble>,
 }
 

@@ -8,7 +8,7 @@ use super::check::{Trouble, fault};
 use super::pin::PinName;
 use super::printer::{Kinematics, Printer};
 
-/// What motors move between two ends: the rail of an axis, or a carriage.
+/// A part that motors move between two ends: the rail of an axis, or a carriage.
 #[derive(Clone, Debug)]
 pub(crate) struct RailConfig<'a> {
     pub(crate) name: &'a str,

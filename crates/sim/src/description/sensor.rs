@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What an ADC reads of a temperature: a thermistor's divider, or any other circuit by its curve.
+//! An ADC's reading of a temperature: a thermistor's divider, or any other circuit by its curve.
 
 #![forbid(unsafe_code)]
 

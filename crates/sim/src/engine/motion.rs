@@ -51,7 +51,7 @@ impl Motor {
     }
 }
 
-/// What motors move between two ends.
+/// A part that motors move between two ends.
 #[derive(Debug)]
 pub struct Rail {
     pub name: String,
@@ -135,7 +135,7 @@ pub struct Axis {
     pub name: String,
     steps_per_mm: f64,
     rail: Arc<Rail>,
-    /// What its motor moves, and the way of one step forward.
+    /// The part that its motor moves, and the way of one step forward.
     moves: Vec<(Arc<Rail>, f64)>,
     /// The first motor of the rail that this one moves too, and the way of its step.
     beside: Option<(Arc<Motor>, f64)>,

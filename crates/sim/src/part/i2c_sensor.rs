@@ -103,7 +103,7 @@ struct Sensor {
     sent: usize,
     /// The last command.
     command: Vec<u8>,
-    /// What the host wrote to registers (BME280, HTU21D, LM75).
+    /// The bytes that the host wrote to registers (BME280, HTU21D, LM75).
     registers: [u8; 256],
 }
 

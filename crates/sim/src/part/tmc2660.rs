@@ -127,7 +127,7 @@ impl SpiChip for Tmc2660 {
 
     fn exchange(&mut self, byte: u8) -> u8 {
         let [out, ..] = self.shift.to_be_bytes();
-        // What comes in behind the answer's 20 bits has the place of the datagram's end.
+        // Bits after the answer's 20 bits stand at the end of the datagram.
         self.shift = self.shift << 8 | u32::from(byte);
         self.bytes += 1;
         out

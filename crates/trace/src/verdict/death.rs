@@ -34,7 +34,7 @@ pub(super) fn hung(record: &Record, diagnosis: &str) -> Finding {
     Finding::new(Culprit::Death, format!("Pinion hung: {diagnosis}{last}"), "report it with its log")
 }
 
-/// What the core did last, as a clause behind others.
+/// The core's last command, as a clause behind others.
 fn doing(record: &Record) -> String {
     record.last_command().map_or_else(String::new, |command| format!(" (the last command was {command})"))
 }

@@ -110,7 +110,7 @@ fn a_pin_of_a_board_that_is_not_there_is_refused() {
 
 #[test]
 fn belts_move_the_head_as_klippys_kinematics_say() {
-    // What each motor does to the place of the head, for a millimeter of its belt.
+    // The move of the head for a millimeter of each motor's belt.
     let cases: [(&str, [[f64; 3]; 3]); 5] = [
         ("cartesian", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         ("corexy", [[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 1.0]]),
