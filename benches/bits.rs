@@ -16,9 +16,7 @@ use pinion_firmware::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use pinion_firmware::lateness::Lateness;
-use pinion_firmware::mcu::{
-    Devices, Dialect, DialectName, Finished, Generation, Mcu, Note, Outbox, SentJob, WorkerId, Workers,
-};
+use pinion_firmware::mcu::{Devices, Dialect, DialectName, Finished, Mcu, Note, Outbox, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
 use pinion_linux::clock::{Monotonic, monotonic, watch_tick};
@@ -417,7 +415,7 @@ impl Printer {
             leds: leds.clone(),
             cell: cell.clone(),
         };
-        let dialect = Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master));
+        let dialect = Dialect::new(&FIRMWARE, &board, DialectName::Master);
         let dialect = Arc::new(dialect.expect("a dialect"));
         let id = |format: &str| dialect.dictionary().responses[format].as_i64().unwrap_or(0) as u32;
         let ids = [id("tmcuart_response oid=%c read=%*s"), id("neopixel_result oid=%c success=%c")];

@@ -10,7 +10,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use pinion_firmware::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
-use pinion_firmware::mcu::{Dialect, DialectName, Generation, MOVE_COUNT, Snapshot};
+use pinion_firmware::mcu::{Dialect, DialectName, MOVE_COUNT, Snapshot};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_testbench::board::{Bench, FakeBoard};
@@ -218,7 +218,7 @@ fn status(c: &mut Criterion) {
 fn dictionary(c: &mut Criterion) {
     let board = FakeBoard(Rig::new().bench);
     c.bench_function("dictionary", |b| {
-        b.iter(|| Dialect::new(&FIRMWARE, black_box(&board), DialectName::Of(Generation::Master)).unwrap())
+        b.iter(|| Dialect::new(&FIRMWARE, black_box(&board), DialectName::Master).unwrap())
     });
 }
 

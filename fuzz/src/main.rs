@@ -38,7 +38,7 @@ const TARGETS: &[Target] = &[
     ("trace", trace::run),
 ];
 
-/// Any commands to an MCU in virtual time, for hosts of each generation.
+/// Any commands to an MCU in virtual time, for hosts of each dialect.
 fn commands(bytes: &[u8]) {
     trial::play(bytes);
 }

@@ -62,7 +62,7 @@ mod tests {
     fn what_is_offered_is_taken_and_all_of_it() {
         assert!(BOARDS.iter().chain(SIMULATED).all(|name| name.parse::<BoardName>().is_ok()));
         assert!(SPOKEN.iter().all(|name| name.parse::<Spoken>().is_ok()));
-        let mut dialects: Vec<String> = DialectName::all().map(|name| name.to_string()).collect();
+        let mut dialects: Vec<String> = DialectName::ALL.into_iter().map(|name| name.to_string()).collect();
         dialects.sort();
         let mut offered = DIALECTS.to_vec();
         offered.sort_unstable();

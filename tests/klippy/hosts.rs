@@ -1,19 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hosts of every generation on the whole simulated printer. Each has its own checkout: `KLIPPER_DIR_V0_11`, `_V0_12`,
+//! Hosts of every dialect on the whole simulated printer. Each has its own checkout: `KLIPPER_DIR_V0_11`, `_V0_12`,
 //! `_V0_13`, `_MASTER` and `_KALICO`. Kalico's branch `bleeding-edge-v2` has `KLIPPER_DIR_KALICO_BLEEDING_EDGE`.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use pinion_firmware::mcu::Generation;
+use pinion_firmware::mcu::DialectName;
 
 use super::drivers::{dump, on_a_port};
 use super::klippy::{Printer, rest, without};
 use super::probes::on_spi;
 
-/// The checkout of a generation; `None` if there is none.
-pub fn checkout(generation: Generation) -> Option<PathBuf> {
-    folder_of(&generation.name().to_uppercase().replace('.', "_"))
+/// The checkout of a dialect; `None` if there is none.
+pub fn checkout(dialect: DialectName) -> Option<PathBuf> {
+    folder_of(&dialect.name().to_uppercase().replace('.', "_"))
 }
 
 /// The checkout in the variable `KLIPPER_DIR_` with this end; `None` if there is none.
@@ -33,14 +33,14 @@ fn with_button(board: String, _trace: &Path) -> String {
     board + "\n[[input]]\nname = \"knob\"\npin = \"knob\"\nlevel = true\n"
 }
 
-fn with_sections(config: String, generation: Generation) -> String {
+fn with_sections(config: String, dialect: DialectName) -> String {
     // At klippy's default of 3200 samples a second, a busy computer is late now and then.
     let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
     // Load cells came with v0.13, and this form of the ADS1220 with master. Kalico's firmware for Linux has no angle
     // sensors.
-    let unknown = |section: &str| match generation {
-        Generation::Master => false,
-        Generation::Kalico => section.starts_with("[angle") || section.starts_with("[load_cell"),
+    let unknown = |section: &str| match dialect {
+        DialectName::Master => false,
+        DialectName::Kalico => section.starts_with("[angle") || section.starts_with("[load_cell"),
         _ => section.starts_with("[load_cell"),
     };
     let sections = config.split_inclusive("\n\n").filter(|section| !unknown(section));
@@ -48,18 +48,18 @@ fn with_sections(config: String, generation: Generation) -> String {
 }
 
 #[test]
-fn hosts_of_all_generations_use_the_whole_printer() {
-    for generation in Generation::ALL {
-        let Some(checkout) = checkout(generation) else { continue };
-        let mut printer = Printer::start_on(&checkout, with_button, |config| with_sections(config, generation));
+fn hosts_of_all_dialects_use_the_whole_printer() {
+    for dialect in DialectName::OF_HOSTS {
+        let Some(checkout) = checkout(dialect) else { continue };
+        let mut printer = Printer::start_on(&checkout, with_button, |config| with_sections(config, dialect));
         printer.until_state("ready");
-        printer.until_logged(&format!(": dialect {generation}, which has "));
-        use_everything(&mut printer, generation);
+        printer.until_logged(&format!(": dialect {dialect}, which has "));
+        use_everything(&mut printer, dialect);
         printer.restart("FIRMWARE_RESTART");
-        use_everything(&mut printer, generation);
+        use_everything(&mut printer, dialect);
         printer.restart("RESTART");
         printer.gcode("G28 X");
-        assert!(!printer.log().contains(" ERROR "), "{generation}: {}", printer.log());
+        assert!(!printer.log().contains(" ERROR "), "{dialect}: {}", printer.log());
     }
 }
 
@@ -67,7 +67,7 @@ fn hosts_of_all_generations_use_the_whole_printer() {
 /// cells.
 #[test]
 fn kalico_uses_a_serial_port_and_an_spi_bus_as_pins() {
-    let Some(checkout) = checkout(Generation::Kalico) else { return };
+    let Some(checkout) = checkout(DialectName::Kalico) else { return };
     let describe = |board: String, trace: &Path| on_spi(on_a_port(board, trace), trace);
     let mut printer = Printer::start_on(&checkout, describe, |config| {
         let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
@@ -124,10 +124,10 @@ fn kalico_prints_with_steps_of_high_precision() {
 /// Steppers, heaters and fan, hardware PWM, ADCs, thermocouple (SPI), DS18B20, accelerometer (SPI), drivers
 /// (SPI and UART), display (I2C), lights (MOSI and software SPI), buttons.
 #[track_caller]
-fn use_everything(printer: &mut Printer, generation: Generation) {
+fn use_everything(printer: &mut Printer, dialect: DialectName) {
     printer.gcode("G28\nG1 X50 Y40 Z10 F6000\nM400");
     let toolhead = printer.object("toolhead");
-    assert_eq!(toolhead["homed_axes"], "xyz", "{generation}");
+    assert_eq!(toolhead["homed_axes"], "xyz", "{dialect}");
     assert_eq!(toolhead["position"][1], 40.0);
     printer.gcode("M140 S40\nM106 S128\nSET_PIN PIN=laser VALUE=0.4\nSET_SERVO SERVO=arm ANGLE=60");
     printer.gcode("SET_LED LED=strip RED=1\nSET_LED LED=dots BLUE=1\nM117 Hello");
@@ -139,13 +139,13 @@ fn use_everything(printer: &mut Printer, generation: Generation) {
         ("temperature_sensor nozzle", 20.0, 30.0),
     ] {
         let celsius = printer.object(sensor)["temperature"].as_f64().unwrap();
-        assert!((from..to).contains(&celsius), "{generation}: {sensor} is at {celsius} C");
+        assert!((from..to).contains(&celsius), "{dialect}: {sensor} is at {celsius} C");
     }
-    assert_eq!(printer.object("gcode_button knob")["state"], "PRESSED", "{generation}");
-    // Gravity, in each generation's wording.
+    assert_eq!(printer.object("gcode_button knob")["state"], "PRESSED", "{dialect}");
+    // Gravity, in each dialect's wording.
     let answer = printer.answer("ACCELEROMETER_QUERY");
     let felt = rest(&answer, "accelerometer values (x, y, z): ");
     let z: f64 = felt.rsplit(", ").next().unwrap().parse().unwrap();
-    assert!((z - 9806.65).abs() < 500.0, "{generation}: {felt}");
-    assert_eq!(printer.state(), "ready", "{generation}");
+    assert!((z - 9806.65).abs() < 500.0, "{dialect}: {felt}");
+    assert_eq!(printer.state(), "ready", "{dialect}");
 }

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use pinion_firmware::mcu::Generation;
+use pinion_firmware::mcu::DialectName;
 
 use super::checkout;
 use super::hosts;
@@ -56,23 +56,23 @@ fn for_each<T: Sync>(items: &[T], work: impl Fn(&T) + Sync) {
 
 /// Removes each section from a configuration that the host accepts whole. `keep` are the sections that this host cannot
 /// omit.
-fn take_out_each(checkout: &Path, generation: Generation, config: &str, keep: &[&str]) {
+fn take_out_each(checkout: &Path, dialect: DialectName, config: &str, keep: &[&str]) {
     let folder = tempfile::tempdir().unwrap();
     let dictionary = folder.path().join("dict");
-    std::fs::write(&dictionary, pinion(&["dict", "--board", "sim", "--dialect", generation.name()])).unwrap();
+    std::fs::write(&dictionary, pinion(&["dict", "--board", "sim", "--dialect", dialect.name()])).unwrap();
     for_each(&sections(config), |section| {
         if ALWAYS.contains(section) || keep.contains(section) {
             return;
         }
         let said = batch(checkout, &dictionary, &without_it(config, section), MOVES);
-        assert!(said.is_ok(), "{generation} without [{section}]: {}", said.unwrap_err());
+        assert!(said.is_ok(), "{dialect} without [{section}]: {}", said.unwrap_err());
         if !in_need(config, section).is_empty() {
             let said = batch(checkout, &dictionary, &without(config, section), MOVES);
-            assert!(said.is_err(), "{generation}: {:?} do without [{section}]", in_need(config, section));
+            assert!(said.is_err(), "{dialect}: {:?} do without [{section}]", in_need(config, section));
         }
     });
-    let out = batch(checkout, &dictionary, config, MOVES).unwrap_or_else(|error| panic!("{generation}: {error}"));
-    assert!(out.len() > 1000, "{generation} wrote only {} bytes", out.len());
+    let out = batch(checkout, &dictionary, config, MOVES).unwrap_or_else(|error| panic!("{dialect}: {error}"));
+    assert!(out.len() > 1000, "{dialect} wrote only {} bytes", out.len());
 }
 
 fn built_in() -> String {
@@ -82,17 +82,17 @@ fn built_in() -> String {
 #[test]
 fn klippy_does_without_any_section_of_printer_cfg() {
     let Some(checkout) = checkout("klippy_does_without_any_section_of_printer_cfg") else { return };
-    take_out_each(&checkout, Generation::Master, &built_in(), &[]);
+    take_out_each(&checkout, DialectName::Master, &built_in(), &[]);
 }
 
 #[test]
 fn kalico_does_without_any_section_of_printer_cfg() {
-    let Some(checkout): Option<PathBuf> = hosts::checkout(Generation::Kalico) else { return };
+    let Some(checkout): Option<PathBuf> = hosts::checkout(DialectName::Kalico) else { return };
     let config = built_in();
     // The section says so.
     let angle = config.split("\n\n").find(|block| block.starts_with("[angle y]")).unwrap();
     assert!(angle.contains("Kalico"), "{angle}");
-    take_out_each(&checkout, Generation::Kalico, &without(&config, "angle y"), &["virtual_sdcard"]);
+    take_out_each(&checkout, DialectName::Kalico, &without(&config, "angle y"), &["virtual_sdcard"]);
 }
 
 /// The sections without hardware that a configuration offers, in use: each one's name, its lines, and the section that
@@ -115,38 +115,38 @@ const THEIR_MOVES: &str = "G28\nG1 X50 Y50 Z5 F3000\nG2 X70 Y50 I10 J0\nG11\nG10
                            RESUME\nEXCLUDE_OBJECT_DEFINE NAME=PART\nSAVE_VARIABLE VARIABLE=one VALUE=1\n";
 
 /// Enables each offered section alone, and then all compatible ones together.
-fn take_in_each(checkout: &Path, generation: Generation, config: &str, moves: &str) {
+fn take_in_each(checkout: &Path, dialect: DialectName, config: &str, moves: &str) {
     let folder = tempfile::tempdir().unwrap();
     let dictionary = folder.path().join("dict");
-    std::fs::write(&dictionary, pinion(&["dict", "--board", "sim", "--dialect", generation.name()])).unwrap();
+    std::fs::write(&dictionary, pinion(&["dict", "--board", "sim", "--dialect", dialect.name()])).unwrap();
     let offered = offered(config);
     assert!(offered.len() > 14, "{offered:?}");
     for_each(&offered, |(name, section, replaced)| {
         let rest = replaced.as_ref().map_or(config.to_owned(), |replaced| without_it(config, replaced));
         let said = batch(checkout, &dictionary, &format!("{rest}\n{section}"), MOVES);
-        assert!(said.is_ok(), "{generation} with [{name}]: {}", said.unwrap_err());
+        assert!(said.is_ok(), "{dialect} with [{name}]: {}", said.unwrap_err());
     });
     let together = offered.iter().filter(|(_, _, replaced)| replaced.is_none());
     let all: String = together.map(|(_, section, _)| format!("\n{section}")).collect();
     let said = batch(checkout, &dictionary, &format!("{config}{all}"), moves);
-    assert!(said.is_ok(), "{generation} with all: {}", said.unwrap_err());
+    assert!(said.is_ok(), "{dialect} with all: {}", said.unwrap_err());
 }
 
 #[test]
 fn klippy_takes_each_section_without_hardware_that_is_offered() {
     let Some(checkout) = checkout("klippy_takes_each_section_without_hardware_that_is_offered") else { return };
-    take_in_each(&checkout, Generation::Master, &built_in(), THEIR_MOVES);
+    take_in_each(&checkout, DialectName::Master, &built_in(), THEIR_MOVES);
 }
 
 #[test]
 fn kalico_takes_each_section_without_hardware_that_is_offered() {
-    let Some(checkout): Option<PathBuf> = hosts::checkout(Generation::Kalico) else { return };
+    let Some(checkout): Option<PathBuf> = hosts::checkout(DialectName::Kalico) else { return };
     // Its [firmware_retraction] is not ready yet in batch mode.
-    take_in_each(&checkout, Generation::Kalico, &without(&built_in(), "angle y"), MOVES);
+    take_in_each(&checkout, DialectName::Kalico, &without(&built_in(), "angle y"), MOVES);
 }
 
 /// Makes a host read the printed configuration for each example of the documentation.
-fn take_the_examples(checkout: &Path, generation: Generation) {
+fn take_the_examples(checkout: &Path, dialect: DialectName) {
     let built_in = String::from_utf8(pinion(&["sim", "--print-board"])).unwrap();
     let examples: [(&str, &[&str]); 6] = [
         ("Four Z motors", &["stepper_z3", "quad_gantry_level"]),
@@ -163,26 +163,26 @@ fn take_the_examples(checkout: &Path, generation: Generation) {
         let config = String::from_utf8(pinion(&["sim", &path("board"), "--print-config"])).unwrap();
         expected.iter().for_each(|section| assert!(sections(&config).contains(section), "no {section} in {heading}"));
         let board = format!("sim:{}", path("board"));
-        let printed = pinion(&["dict", "--board", &board, "--dialect", generation.name()]);
+        let printed = pinion(&["dict", "--board", &board, "--dialect", dialect.name()]);
         std::fs::write(path("dict"), printed).unwrap();
         // Kalico has no angle sensors here.
-        let config = match generation {
-            Generation::Kalico if config.contains("[angle y]") => without(&config, "angle y"),
+        let config = match dialect {
+            DialectName::Kalico if config.contains("[angle y]") => without(&config, "angle y"),
             _ => config,
         };
         let said = batch(checkout, Path::new(&path("dict")), &config, "G28\nG1 X30 Y20 Z5 F3000\n");
-        assert!(said.is_ok(), "{generation}, {heading}: {}", said.unwrap_err());
+        assert!(said.is_ok(), "{dialect}, {heading}: {}", said.unwrap_err());
     });
 }
 
 #[test]
 fn klippy_takes_the_examples_of_the_documentation() {
     let Some(checkout) = checkout("klippy_takes_the_examples_of_the_documentation") else { return };
-    take_the_examples(&checkout, Generation::Master);
+    take_the_examples(&checkout, DialectName::Master);
 }
 
 #[test]
 fn kalico_takes_the_examples_of_the_documentation() {
-    let Some(checkout): Option<PathBuf> = hosts::checkout(Generation::Kalico) else { return };
-    take_the_examples(&checkout, Generation::Kalico);
+    let Some(checkout): Option<PathBuf> = hosts::checkout(DialectName::Kalico) else { return };
+    take_the_examples(&checkout, DialectName::Kalico);
 }

@@ -261,7 +261,7 @@ fn ids_are_as_the_hosts_can_take_them() {
 /// A host of v0.13, of master or of Kalico finds all its messages in the union, except for these. The three have them
 /// in different forms.
 #[test]
-fn the_union_is_what_three_generations_take() {
+fn the_union_is_what_three_dialects_have() {
     let union = dictionary("union");
     let mut other_forms = Vec::new();
     for (dialect, theirs) in FIRMWARES.iter().filter(|(dialect, _)| ["v0.13", "master", "kalico"].contains(dialect)) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hosts of several generations, recognized by their sources. A shell with klippy's name has the pty open, and our own
+//! Hosts of several dialects, recognized by their sources. A shell with klippy's name has the pty open, and our own
 //! client sends klippy's messages.
 
 use std::fs;
@@ -95,7 +95,7 @@ fn until_once_more<T>(pinion: &Pinion, text: &str, act: impl FnOnce() -> T) -> T
 }
 
 #[test]
-fn each_host_gets_the_dictionary_of_its_generation() {
+fn each_host_gets_the_dictionary_of_its_dialect() {
     let pinion = Pinion::simulated(&[]);
     for dialect in ["v0.11", "v0.12", "v0.13", "master", "kalico"] {
         let checkout = Checkout::of(dialect);
@@ -165,7 +165,7 @@ fn a_dialect_that_is_named_is_spoken_whoever_comes() {
     assert!(error.contains("v0.11, v0.12, v0.13, master, kalico, union"), "{error}");
 }
 
-/// The reading of a thermistor, with a generation's message.
+/// The reading of a thermistor, with a dialect's message.
 fn read_temperature(pinion: &Pinion, query: &str) -> String {
     let mut client = pinion.client();
     let mut config = Config::default();

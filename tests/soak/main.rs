@@ -186,8 +186,8 @@ impl Day {
     /// A host's life, from its first word until the MCU stops or the day ends.
     fn session(&mut self, end: u64) {
         let printer = &mut self.printer;
-        let generation = printer.generation();
-        printer.meet(generation);
+        let dialect = printer.any_dialect();
+        printer.meet(dialect);
         self.reset();
         if self.printer.dice.below(4) == 0 {
             self.miss_a_bus();

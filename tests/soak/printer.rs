@@ -8,7 +8,7 @@ use std::time::Instant;
 use pinion_client::messages::Messages;
 use pinion_client::serial::Received;
 use pinion_client::{Arg, Params};
-use pinion_firmware::mcu::{Dialect, DialectName, Generation, Snapshot};
+use pinion_firmware::mcu::{Dialect, DialectName, Snapshot};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use pinion_testbench::dice::Dice;
@@ -89,8 +89,8 @@ impl Printer {
             let printer = SimConfig::parse(&printer, "the default printer").unwrap();
             let board = SimBoard::new(printer, Arc::new(clock.clone())).unwrap();
             probe = Some(board.probe());
-            let dialect = |of: &Generation| Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(*of)).unwrap());
-            dialects = Generation::ALL.iter().map(dialect).collect();
+            let dialect = |of: &DialectName| Arc::new(Dialect::new(&FIRMWARE, &board, *of).unwrap());
+            dialects = DialectName::OF_HOSTS.iter().map(dialect).collect();
             FaultyBoard { board, faults: faults.clone(), clock }
         });
         let dice = Dice(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15));
@@ -123,8 +123,8 @@ impl Printer {
     // ---- a host
 
     /// A host begins to talk to the MCU, in a dialect of its own. It reads its dictionary.
-    pub fn meet(&mut self, generation: usize) {
-        let dialect = self.dialects[generation].clone();
+    pub fn meet(&mut self, dialect: usize) {
+        let dialect = self.dialects[dialect].clone();
         self.note(format!("a host of {}", dialect.name()));
         self.rig.mcu.speak(dialect.clone());
         self.messages = Messages::new(dialect.dictionary());
@@ -147,8 +147,8 @@ impl Printer {
         self.tally.hosts += 1;
     }
 
-    pub fn generation(&mut self) -> usize {
-        self.dice.below(Generation::ALL.len())
+    pub fn any_dialect(&mut self) -> usize {
+        self.dice.below(DialectName::OF_HOSTS.len())
     }
 
     pub fn has_parameter(&self, command: &str, parameter: &str) -> bool {

@@ -19,7 +19,7 @@
 //! use std::sync::{Arc, Mutex};
 //!
 //! use pinion_firmware::mcu::{
-//!     Dialect, DialectName, Feature, Firmware, Generation, Mcu, Note, Outbox, Response, Wire, base, place_of_response,
+//!     Dialect, DialectName, Feature, Firmware, Mcu, Note, Outbox, Response, Wire, base, place_of_response,
 //! };
 //! use pinion_firmware::protocol::vlq::{Reader, Writer};
 //! use pinion_firmware::time::{Clock, Timing, VirtualClock};
@@ -67,7 +67,7 @@
 //!     let board = FakeBoard(bench.clone());
 //!     let firmware =
 //!         Firmware { features: FEATURES, app: "Echo", version: "1", build_versions: "", license: "", wire: Wire::Terminal };
-//!     let dialect = Dialect::new(&firmware, &board, DialectName::Of(Generation::Master)).unwrap();
+//!     let dialect = Dialect::new(&firmware, &board, DialectName::Master).unwrap();
 //!     let (dialect, said) = (Arc::new(dialect), Said::default());
 //!     let workers = Box::new(FakeWorkers::new(bench));
 //!     let timing = Timing::of(Arc::new(clock));

@@ -2,7 +2,7 @@
 //! After configuration, the core allocates nothing in a whole print. An allocation may wait for a lock or for the
 //! kernel, and a step would wait with it.
 
-use pinion_firmware::mcu::Generation::{Kalico, V0_12};
+use pinion_firmware::mcu::DialectName::{Kalico, V0_12};
 use pinion_firmware::mcu::Snapshot;
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::memory::{Counting, allocations};

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Mcu, Note, Outbox, Wire};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Mcu, Note, Outbox, Wire};
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing, VirtualClock};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
@@ -85,12 +85,12 @@ impl Rig {
 
     /// An MCU with another board than the bench's own.
     pub fn on_board<B: Board + 'static>(start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
-        Rig::that_speaks(DialectName::Of(Generation::Master), start, board)
+        Rig::that_speaks(DialectName::Master, start, board)
     }
 
-    /// An MCU for hosts of this generation.
-    pub fn of(generation: Generation) -> Rig {
-        Rig::that_speaks(DialectName::Of(generation), ORIGIN, FakeBoard)
+    /// An MCU for hosts of this dialect.
+    pub fn of(name: DialectName) -> Rig {
+        Rig::that_speaks(name, ORIGIN, FakeBoard)
     }
 
     /// An MCU with a dialect that was made before.
@@ -339,9 +339,9 @@ impl Rig {
         self.mcu.dialect()
     }
 
-    /// Gives the MCU the dialect of another generation. It may not use it before a reset.
-    pub fn speak(&mut self, generation: Generation) {
-        let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
+    /// Gives the MCU another dialect. It may not use it before a reset.
+    pub fn speak(&mut self, name: DialectName) {
+        let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), name);
         self.mcu.speak(Arc::new(dialect.unwrap()));
     }
 

@@ -3,7 +3,7 @@
 //! property test and a fuzzer can.
 //!
 //! The commands come from the dictionary, so a new feature is covered as soon as it is listed. Each command is tried
-//! once for each generation of hosts, to find arguments that it accepts ([`Book`]). A trial then sends accepted
+//! once for each dialect of hosts, to find arguments that it accepts ([`Book`]). A trial then sends accepted
 //! arguments and changes some of them. What must hold:
 //!
 //! - Nothing panics. Every response has the form of the dictionary.
@@ -18,7 +18,7 @@ use std::collections::{HashMap, HashSet};
 use std::ops::AddAssign;
 use std::sync::{Arc, OnceLock};
 
-use pinion_firmware::mcu::{Dialect, Generation, Snapshot};
+use pinion_firmware::mcu::{Dialect, DialectName, Snapshot};
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::format::{self, Conversion};
@@ -151,9 +151,9 @@ fn is_pin(parameter: &str) -> bool {
 /// A command with its arguments.
 type Call = (usize, Vec<Value>);
 
-/// The commands of a generation's hosts.
+/// The commands of a dialect.
 struct Book {
-    generation: Generation,
+    name: DialectName,
     dialect: Arc<Dialect>,
     forms: Vec<Form>,
     /// The commands of a whole configuration.
@@ -167,27 +167,25 @@ struct Book {
     wrong: HashSet<(usize, u32)>,
 }
 
-/// In the order of [`Generation::ALL`].
-static BOOKS: [OnceLock<Book>; Generation::ALL.len()] = [const { OnceLock::new() }; Generation::ALL.len()];
+/// In the order of [`DialectName::OF_HOSTS`].
+static BOOKS: [OnceLock<Book>; DialectName::OF_HOSTS.len()] = [const { OnceLock::new() }; DialectName::OF_HOSTS.len()];
 
 fn book(which: usize) -> &'static Book {
     let which = which % BOOKS.len();
-    BOOKS[which].get_or_init(|| Book::of(Generation::ALL[which]))
+    BOOKS[which].get_or_init(|| Book::of(DialectName::OF_HOSTS[which]))
 }
 
-/// The commands that were accepted with no arguments that were tried, with their generations. The trials do not test
+/// The commands that were accepted with no arguments that were tried, with their dialects. The trials do not test
 /// them.
 pub fn commands_without_arguments() -> Vec<String> {
     let books = (0..BOOKS.len()).map(book);
-    books
-        .flat_map(|book| book.without_arguments().map(|form| format!("{}: {}", book.generation, form.format)))
-        .collect()
+    books.flat_map(|book| book.without_arguments().map(|form| format!("{}: {}", book.name, form.format))).collect()
 }
 
 impl Book {
-    fn of(generation: Generation) -> Book {
+    fn of(name: DialectName) -> Book {
         // To compress a dictionary takes milliseconds: it is done once.
-        let dialect = Rig::of(generation).mcu.dialect().clone();
+        let dialect = Rig::of(name).mcu.dialect().clone();
         let rig = bench(&dialect);
         let forms = rig.dictionary().commands.iter().map(|(format, id)| Form {
             format: format.clone(),
@@ -200,7 +198,7 @@ impl Book {
         let conversions = |format: &str| format::parameters(format).unwrap().into_iter().map(|(_, c)| c).collect();
         let responses = rig.dictionary().responses.iter();
         let responses = responses.map(|(format, id)| (id.as_i64().unwrap() as u32, conversions(format))).collect();
-        let mut book = Book { generation, dialect, before, after, responses, wrong, setup: Vec::new(), forms };
+        let mut book = Book { name, dialect, before, after, responses, wrong, setup: Vec::new(), forms };
         let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
         book.find_setup(&mut dice);
         book.find_calls(&mut dice);
@@ -614,7 +612,7 @@ struct Trial<'a> {
 impl Drop for Trial<'_> {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!("{}, after a configuration:\n{}", self.book.generation, self.story.join("\n"));
+            eprintln!("{}, after a configuration:\n{}", self.book.name, self.story.join("\n"));
         }
     }
 }

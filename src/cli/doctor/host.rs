@@ -189,13 +189,13 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
     let serves = |instance: &&Instance| instance.link.as_ref().is_some_and(|link| klippy.opens(link));
     let told = instances.iter().filter(serves).filter_map(|instance| Some((instance, instance.settings.dialect?)));
     let told: Vec<(&Instance, DialectName)> = told.collect();
-    let wrong = told.iter().find(|(_, name)| *name != DialectName::Of(best.generation));
+    let wrong = told.iter().find(|(_, name)| *name != best.dialect);
     let mut findings = vec![match (wrong, told.is_empty()) {
-        (None, true) => Finding::ok(DIALECT, format!("{host}: it is served in the dialect {}", best.generation)),
-        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as Pinion is told", best.generation)),
+        (None, true) => Finding::ok(DIALECT, format!("{host}: it is served in the dialect {}", best.dialect)),
+        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as Pinion is told", best.dialect)),
         (Some((instance, name)), _) => Finding::warning(
             DIALECT,
-            format!("{host}: its dialect is {}, and Pinion is told to speak {name}", best.generation),
+            format!("{host}: its dialect is {}, and Pinion is told to speak {name}", best.dialect),
             format!("dialect = \"auto\" in {}, then {}", instance.config(), instance.restart()),
         ),
     }];
@@ -217,7 +217,7 @@ mod tests {
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use pinion_firmware::mcu::Generation;
+    use pinion_firmware::mcu::DialectName;
     use pinion_runtime::klippy::sources::Shape;
 
     const PI: u32 = 54_321;
@@ -268,10 +268,10 @@ mod tests {
         told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
         let commands = FEATURES.iter().flat_map(|feature| feature.commands);
         let responses = FEATURES.iter().flat_map(|feature| feature.responses);
-        let formats = commands.map(|one| (one.format, one.generations));
+        let formats = commands.map(|one| (one.format, one.dialects));
         let forms: Vec<String> = formats
-            .chain(responses.map(|one| (one.format, one.generations)))
-            .filter(|(_, generations)| generations.contains(Generation::V0_12))
+            .chain(responses.map(|one| (one.format, one.dialects)))
+            .filter(|(_, dialects)| dialects.contains(DialectName::V0_12))
             .filter_map(|(format, _)| Shape::of(format))
             .map(|shape| {
                 let form = shape.as_str();

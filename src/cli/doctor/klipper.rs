@@ -29,7 +29,7 @@ pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
 /// The verdict in a line.
 pub(super) fn finding(checkout: &Checkout) -> Finding {
     const CHECK: &str = "checkout";
-    let host = format!("{} is served in the dialect {}", checkout.folder.display(), checkout.best().generation);
+    let host = format!("{} is served in the dialect {}", checkout.folder.display(), checkout.best().dialect);
     match checkout.unknown().count() {
         0 => Finding::ok(CHECK, host),
         forms => Finding::error(
@@ -52,8 +52,8 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
     ));
     page.line("");
     for verdict in &checkout.verdicts {
-        let mark = if verdict.generation == best.generation { "  <- the one that it is served" } else { "" };
-        page.line(format_args!("  {:<8}{:>4}{mark}", verdict.generation.name(), verdict.served.len()));
+        let mark = if verdict.dialect == best.dialect { "  <- the one that it is served" } else { "" };
+        page.line(format_args!("  {:<8}{:>4}{mark}", verdict.dialect.name(), verdict.served.len()));
     }
     if let Some(unread) = &checkout.unread {
         page.line("");
@@ -66,7 +66,7 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
             checkout.verdicts.iter().map(|verdict| format!("{:<8}", of(verdict))).collect()
         };
         page.append(&Page::text("\nNot every dialect has these forms:\n\n"));
-        page.line(format_args!("  {}", columns(&|verdict| verdict.generation.name())));
+        page.line(format_args!("  {}", columns(&|verdict| verdict.dialect.name())));
         for shape in differing {
             let has = columns(&|verdict| if verdict.served.contains(shape) { "yes" } else { "-" });
             page.line(format_args!("  {has}{}", shape.as_str()));
@@ -82,7 +82,7 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
                  Linux has no more than the dialect"
             ),
         };
-        page.line(format_args!("ok: this host is served in the dialect {}{other}", best.generation));
+        page.line(format_args!("ok: this host is served in the dialect {}{other}", best.dialect));
     } else {
         page.line(
             "warning: this host is newer than Pinion. No dialect has these forms, and what needs them will not work:",
@@ -92,7 +92,7 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
         page.line("");
         page.line(format_args!(
             "It would be served in the dialect {}. Update Pinion first (apt upgrade), or stay with the host's version.",
-            best.generation
+            best.dialect
         ));
     }
 }

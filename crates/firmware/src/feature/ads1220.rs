@@ -8,7 +8,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, JobSlot, Oid, command, since,
+    Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Feature, JobSlot, Oid, command,
+    since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;

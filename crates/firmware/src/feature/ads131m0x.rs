@@ -8,7 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Enumeration, Feature, Generation::Kalico, Generation::Master, JobSlot, Oid, command, since,
+    Command, Context, DialectName::Kalico, DialectName::Master, Enumeration, Feature, JobSlot, Oid, command, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;

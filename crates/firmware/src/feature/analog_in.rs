@@ -8,8 +8,8 @@
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, Feature, Finished, Generation::Kalico,
-    Generation::Master, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Present, Report, Response, Timer, Unread,
+    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, DialectName::Kalico, DialectName::Master,
+    DialectName::V0_13, Feature, Finished, Job, JobSlot, Next, Object, Oid, Present, Report, Response, Timer, Unread,
     WireClock, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};

@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Generation::Master, Oid, command, since};
+use crate::mcu::{Command, DialectName::Master, Feature, Oid, command, since};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};

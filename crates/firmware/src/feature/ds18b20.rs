@@ -9,7 +9,7 @@
 
 use crate::board::Thermometer;
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Generation::Kalico, Generations, Job, JobSlot, Next, Object,
+    Back, Command, Context, DeviceId, DialectName::Kalico, Dialects, Feature, Finished, Job, JobSlot, Next, Object,
     Oid, Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -181,7 +181,7 @@ const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
     |context, oid: Oid, serial: &[u8], max_error_count: u8| configure(context, oid, serial, max_error_count, false)
 )
-.of(Generations::ALL.except(Kalico));
+.of(Dialects::ALL.except(Kalico));
 
 const CONFIG_DS18B20_OF_KALICO: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c ignore_limits=%c",

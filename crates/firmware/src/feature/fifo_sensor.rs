@@ -11,7 +11,7 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Back, Chip, Context, Enumeration, Feature, Finished, Generation::V0_13, Job, JobSlot, Next, Object, Oid, Timer,
+    Back, Chip, Context, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Timer,
     WireClock, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};

@@ -13,8 +13,8 @@
 
 use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Job, JobSlot, Oid, Remote, Settable, command, since,
+    Back, Command, Context, DeviceId, DeviceWarning, DialectName::Kalico, DialectName::Master, DialectName::V0_13,
+    Feature, Finished, Job, JobSlot, Oid, Remote, Settable, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;

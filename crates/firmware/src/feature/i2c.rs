@@ -11,9 +11,9 @@
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
-    Generation::V0_11, Generation::V0_12, Generation::V0_13, Job, JobSlot, Object, Oid, Response, command, only,
-    response, since, until,
+    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_11,
+    DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Object, Oid, Response,
+    command, only, response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};

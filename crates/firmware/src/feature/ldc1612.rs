@@ -12,9 +12,8 @@ use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
 use crate::mcu::{
-    Back, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Generations, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only,
-    response, since,
+    Back, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Dialects, Enumeration,
+    Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only, response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -49,7 +48,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 /// The hosts that home by the sensor itself. For them a failing bus stops the MCU.
-const HOMES_ITSELF: Generations = only(V0_13).and(Kalico);
+const HOMES_ITSELF: Dialects = only(V0_13).and(Kalico);
 
 response! {
     /// Whether samples are checked for homing, and when the trigger came.

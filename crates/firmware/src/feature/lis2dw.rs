@@ -8,7 +8,8 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Command, Enumeration, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, only, since,
+    Command, DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Oid, Response, WireClock, command, only,
+    since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;

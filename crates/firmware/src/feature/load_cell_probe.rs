@@ -6,7 +6,7 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Context, Feature, Generation::Kalico, Next, Object, Oid, Response, Timer, WireClock, command, response,
+    Command, Context, DialectName::Kalico, Feature, Next, Object, Oid, Response, Timer, WireClock, command, response,
     since,
 };
 use crate::shutdown::{Shutdown, shutdowns};

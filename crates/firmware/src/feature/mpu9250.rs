@@ -8,7 +8,7 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Command, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, since, until,
+    Command, DialectName::V0_12, DialectName::V0_13, Feature, Oid, Response, WireClock, command, since, until,
 };
 use crate::time::Ticks;
 

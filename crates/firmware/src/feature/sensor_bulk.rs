@@ -11,7 +11,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Context, Feature, Generation::V0_13, Oid, Response, response, since};
+use crate::mcu::{Context, DialectName::V0_13, Feature, Oid, Response, response, since};
 use crate::time::Clock;
 
 pub(super) const FEATURE: Feature = Feature { responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };

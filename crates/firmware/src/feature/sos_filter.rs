@@ -6,7 +6,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Command, Feature, Generation::Kalico, Generation::Master, Object, Oid, command, since};
+use crate::mcu::{Command, DialectName::Kalico, DialectName::Master, Feature, Object, Oid, command, since};
 use crate::shutdown::{Shutdown, shutdowns};
 
 pub(super) const FEATURE: Feature = Feature {

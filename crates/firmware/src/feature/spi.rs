@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
+    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Enumeration,
+    Feature, Finished, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};

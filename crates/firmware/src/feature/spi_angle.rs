@@ -8,8 +8,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Generation::V0_12, Generation::V0_13,
-    Generations, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,
+    Back, Command, Context, DialectName::Kalico, DialectName::V0_12, DialectName::V0_13, Dialects, Enumeration,
+    Feature, Finished, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -30,7 +30,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 /// The hosts that know these sensors. Kalico has them only for other boards.
-const KNOWN: Generations = Generations::ALL.except(Kalico);
+const KNOWN: Dialects = Dialects::ALL.except(Kalico);
 
 const TYPES: [(&str, u8); 5] = [("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)];
 /// How many of them v0.12 knows.

@@ -8,7 +8,7 @@ use std::ops::Range;
 
 use crate::board::Pin;
 use crate::mcu::{
-    Batch, Command, Constant, Context, Feature, Generation::Kalico, Generation::V0_13, MoveQueue, Next, Object, Oid,
+    Batch, Command, Constant, Context, DialectName::Kalico, DialectName::V0_13, Feature, MoveQueue, Next, Object, Oid,
     Present, PromptLine, Report, Response, SPIN_MAX, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};

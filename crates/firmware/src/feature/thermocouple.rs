@@ -7,7 +7,7 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Back, Command, Context, Enumeration, Feature, Finished, Generation::Kalico, Job, JobSlot, Next, Object, Oid,
+    Back, Command, Context, DialectName::Kalico, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid,
     Response, Timer, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};

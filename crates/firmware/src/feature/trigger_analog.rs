@@ -6,8 +6,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Context, Enumeration, Feature, Generation::Master, Next, Object, Oid, Response, Timer, WireClock, command,
-    response, since,
+    Command, Context, DialectName::Master, Enumeration, Feature, Next, Object, Oid, Response, Timer, WireClock,
+    command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};

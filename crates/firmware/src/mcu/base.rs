@@ -7,7 +7,7 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
 
 use super::stats::SUMSQ_BASE;
-use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response, command, response};
+use super::{Command, Constant, Dialects, Enumeration, Feature, Form, Response, command, response};
 
 /// This file's entries in the dictionary.
 pub const FEATURE: Feature = Feature {
@@ -49,7 +49,7 @@ const RESPONSES: &[Form] = &[
     Stats::FORM,
     Pong::FORM,
     // Never sent, because `debug_read` is refused. The firmware's dictionary has it.
-    Form { format: "debug_result val=%u", generations: Generations::ALL },
+    Form { format: "debug_result val=%u", dialects: Dialects::ALL },
 ];
 
 /// How many bytes the host may send before an acknowledgement. It is half of a pty's buffer of 4096 bytes. So the

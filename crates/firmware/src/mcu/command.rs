@@ -10,7 +10,7 @@ use pinion_protocol::Malformed;
 use pinion_protocol::format::same;
 use pinion_protocol::vlq::{Reader, Writer};
 
-use super::{Generations, Mcu, Wire};
+use super::{Dialects, Mcu, Wire};
 
 impl From<Malformed> for Shutdown {
     /// The cause is empty. [`Mcu::execute`] adds the name of the command.
@@ -28,7 +28,7 @@ pub struct Command {
     /// Name, parameters and their conversions, exactly as klippy looks them up.
     pub format: &'static str,
     /// The hosts that use this form.
-    pub generations: Generations,
+    pub dialects: Dialects,
     /// Whether it also runs after a shutdown.
     pub in_shutdown: bool,
     /// Whether it may join a command of the same kind: see [`Command::joining`].
@@ -40,7 +40,7 @@ pub struct Command {
 impl Command {
     /// A command for all hosts that runs while the MCU is not stopped. [`command!`](crate::command) declares one.
     pub const fn new(format: &'static str, handler: Handler) -> Command {
-        Command { format, generations: Generations::ALL, in_shutdown: false, joins: false, handler }
+        Command { format, dialects: Dialects::ALL, in_shutdown: false, joins: false, handler }
     }
 
     /// Lets the command run after a shutdown too (`HF_IN_SHUTDOWN`).
@@ -58,8 +58,8 @@ impl Command {
 
     /// The hosts that use this form: [`since`](super::since), [`until`](super::until) or [`only`](super::only). Without
     /// this, all hosts use it.
-    pub const fn of(mut self, generations: Generations) -> Command {
-        self.generations = generations;
+    pub const fn of(mut self, dialects: Dialects) -> Command {
+        self.dialects = dialects;
         self
     }
 }
@@ -69,7 +69,7 @@ pub struct Form {
     /// Name, parameters and their conversions.
     pub format: &'static str,
     /// The hosts that use this form.
-    pub generations: Generations,
+    pub dialects: Dialects,
 }
 
 /// A message to the host.
@@ -89,7 +89,7 @@ pub struct Constant {
     /// Its value.
     pub value: ConstantValue,
     /// The hosts whose dictionary has it.
-    pub generations: Generations,
+    pub dialects: Dialects,
 }
 
 /// The value of a constant.
@@ -103,17 +103,17 @@ pub enum ConstantValue {
 impl Constant {
     /// A constant that is a number.
     pub const fn number(name: &'static str, number: u32) -> Constant {
-        Constant { name, value: ConstantValue::Number(number), generations: Generations::ALL }
+        Constant { name, value: ConstantValue::Number(number), dialects: Dialects::ALL }
     }
 
     /// A constant that is a text.
     pub const fn text(name: &'static str, text: &'static str) -> Constant {
-        Constant { name, value: ConstantValue::Text(text), generations: Generations::ALL }
+        Constant { name, value: ConstantValue::Text(text), dialects: Dialects::ALL }
     }
 
     /// The hosts whose dictionary has it. Without this, all do.
-    pub const fn of(mut self, generations: Generations) -> Constant {
-        self.generations = generations;
+    pub const fn of(mut self, dialects: Dialects) -> Constant {
+        self.dialects = dialects;
         self
     }
 }
@@ -125,18 +125,18 @@ pub struct Enumeration {
     /// The names on this board, and their values.
     pub values: fn(&dyn Board) -> Vec<Range>,
     /// The hosts whose dictionary has it.
-    pub generations: Generations,
+    pub dialects: Dialects,
 }
 
 impl Enumeration {
     /// An enumeration.
     pub const fn new(name: &'static str, values: fn(&dyn Board) -> Vec<Range>) -> Enumeration {
-        Enumeration { name, values, generations: Generations::ALL }
+        Enumeration { name, values, dialects: Dialects::ALL }
     }
 
     /// The hosts whose dictionary has it with these values. Without this, all do.
-    pub const fn of(mut self, generations: Generations) -> Enumeration {
-        self.generations = generations;
+    pub const fn of(mut self, dialects: Dialects) -> Enumeration {
+        self.dialects = dialects;
         self
     }
 }
@@ -225,7 +225,7 @@ macro_rules! command {
 /// responses ([`place_of_response`]). The build fails if the format is not listed.
 #[macro_export]
 macro_rules! response {
-    ($(#[$doc:meta])* $format:literal $(=> $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
+    ($(#[$doc:meta])* $format:literal $(=> $dialects:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
         $($field:ident: $t:ty),* $(,)?
     }) => {
         $(#[$doc])*
@@ -240,9 +240,9 @@ macro_rules! response {
                     }),*]),
                     concat!("fields disagree with \"", $format, "\"")
                 );
-                // The given generations, or else all.
-                let generations = [$($generations,)? $crate::mcu::Generations::ALL][0];
-                $crate::mcu::Form { format: $format, generations }
+                // The given dialects, or else all.
+                let dialects = [$($dialects,)? $crate::mcu::Dialects::ALL][0];
+                $crate::mcu::Form { format: $format, dialects }
             };
             const INDEX: usize = super::response_index($format);
             fn encode(&self, writer: &mut $crate::protocol::vlq::Writer) {

@@ -10,7 +10,7 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 use super::stop::Subject;
 use super::{DeviceWarning, Note};
-use super::{Dialect, Generations, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
+use super::{Dialect, Dialects, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 
 /// The operations that a feature may use in a call. The timers and jobs that an object starts here are its own.
 ///
@@ -47,8 +47,8 @@ impl<'a> Context<'a> {
         self.state.wire.speaks::<R>()
     }
 
-    /// Whether the MCU behaves as hosts of these generations expect, where no form of a message differs.
-    pub fn serves(&self, hosts: Generations) -> bool {
+    /// Whether the MCU behaves as hosts of these dialects expect, where no form of a message differs.
+    pub fn serves(&self, hosts: Dialects) -> bool {
         self.state.wire.serves(hosts)
     }
 

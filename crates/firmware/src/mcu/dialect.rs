@@ -15,7 +15,7 @@ use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::Reader;
 
 use super::command::{Command, ConstantValue, Feature, Handler};
-use super::{DialectName, Generation, Generations, Wire, base, since};
+use super::{DialectName, Dialects, Wire, base, since};
 
 /// The remedy for a host with another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
@@ -78,21 +78,21 @@ fn all<'a, T>(
 /// The forms of one kind that a dialect has.
 struct Choice<T: 'static> {
     /// The name of a form, and the hosts that use it.
-    facts: fn(&'static T) -> (&'static str, Generations),
-    /// Maps each name to the generation whose form the dialect uses.
-    chosen: HashMap<&'static str, Generation>,
+    facts: fn(&'static T) -> (&'static str, Dialects),
+    /// Maps each name to the part of the dialect whose form it uses.
+    chosen: HashMap<&'static str, DialectName>,
 }
 
 impl<T> Choice<T> {
     fn new(
         dialect: &DialectName,
         forms: impl Iterator<Item = &'static T> + Clone,
-        facts: fn(&'static T) -> (&'static str, Generations),
+        facts: fn(&'static T) -> (&'static str, Dialects),
     ) -> Choice<T> {
         let mut chosen = HashMap::new();
-        for generation in dialect.generations() {
-            for (name, _) in forms.clone().map(facts).filter(|(_, takers)| takers.contains(*generation)) {
-                chosen.entry(name).or_insert(*generation);
+        for part in dialect.parts() {
+            for (name, _) in forms.clone().map(facts).filter(|(_, takers)| takers.contains(*part)) {
+                chosen.entry(name).or_insert(*part);
             }
         }
         Choice { facts, chosen }
@@ -100,7 +100,7 @@ impl<T> Choice<T> {
 
     fn has(&self, form: &'static T) -> bool {
         let (name, takers) = (self.facts)(form);
-        self.chosen.get(name).is_some_and(|generation| takers.contains(*generation))
+        self.chosen.get(name).is_some_and(|part| takers.contains(*part))
     }
 }
 
@@ -146,8 +146,8 @@ impl Firmware {
 
 /// A dictionary that describes the program and has no messages yet.
 fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
-    let hosts = since(Generation::V0_13);
-    let is_named = name.generations().iter().any(|generation| hosts.contains(*generation));
+    let hosts = since(DialectName::V0_13);
+    let is_named = name.parts().iter().any(|part| hosts.contains(*part));
     let named = |text: &str| if is_named { text.to_owned() } else { String::new() };
     Dictionary {
         app: named(firmware.app),
@@ -167,11 +167,10 @@ fn number(firmware: &Firmware, name: &DialectName, dictionary: &mut Dictionary) 
     let mut ids = ids();
     let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
     let (mut commands, mut response_ids) = (Vec::new(), Vec::new());
-    let responses = Choice::new(name, firmware.all(|feature| feature.responses), |form| {
-        (format::name(form.format), form.generations)
-    });
+    let responses =
+        Choice::new(name, firmware.all(|feature| feature.responses), |form| (format::name(form.format), form.dialects));
     let taken = Choice::new(name, firmware.all(|feature| feature.commands), |command| {
-        (format::name(command.format), command.generations)
+        (format::name(command.format), command.dialects)
     });
     // The MCU's own messages have the same ids in every dialect. The MCU may get another dialect after its host has
     // read the dictionary. That host's `emergency_stop` must still work.
@@ -209,7 +208,7 @@ fn number(firmware: &Firmware, name: &DialectName, dictionary: &mut Dictionary) 
 /// Adds the constants and enumerations of a dialect to the dictionary.
 fn publish_names(firmware: &Firmware, name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
     let constants = firmware.all(|feature| feature.constants);
-    let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.generations));
+    let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.dialects));
     for constant in constants.filter(|constant| had.has(constant)) {
         let value = match constant.value {
             ConstantValue::Number(number) => json!(number),
@@ -222,7 +221,7 @@ fn publish_names(firmware: &Firmware, name: &DialectName, board: &dyn Board, dic
     }
     dictionary.config.extend(board.constants());
     let enumerations = firmware.all(|feature| feature.enumerations);
-    let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
+    let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.dialects));
     for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
         let values = names((enumeration.values)(board));
         dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
@@ -257,8 +256,8 @@ impl Dialect {
     }
 
     /// Whether the MCU behaves as these hosts expect, where the form of a message does not say it.
-    pub(super) fn serves(&self, hosts: Generations) -> bool {
-        self.name.generations().first().is_some_and(|generation| hosts.contains(*generation))
+    pub(super) fn serves(&self, hosts: Dialects) -> bool {
+        self.name.parts().first().is_some_and(|part| hosts.contains(*part))
     }
 
     /// The dictionary.

@@ -9,7 +9,7 @@ use crate::shutdown::{Shutdown, reason};
 use pinion_protocol::vlq::{Reader, Writer};
 
 use super::dialect::READ_ANEW;
-use super::{Dialect, Generations, Mcu, Note, Outbox, Response, State, base};
+use super::{Dialect, Dialects, Mcu, Note, Outbox, Response, State, base};
 
 /// The way to the host and to the log.
 pub(super) struct HostWire {
@@ -54,8 +54,8 @@ impl HostWire {
         self.dialect.response_id::<R>().is_some()
     }
 
-    /// Whether the MCU behaves as hosts of these generations expect.
-    pub(super) fn serves(&self, hosts: Generations) -> bool {
+    /// Whether the MCU behaves as hosts of these dialects expect.
+    pub(super) fn serves(&self, hosts: Dialects) -> bool {
         self.dialect.serves(hosts)
     }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! No bytes from a host can break the MCU.
 
-use pinion_firmware::mcu::Generation::{self, Kalico, Master, V0_11, V0_12, V0_13};
+use pinion_firmware::mcu::DialectName::{self, Kalico, Master, Union, V0_11, V0_12, V0_13};
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::Writer;
@@ -36,21 +36,21 @@ const OBJECTS: &[&str] = &[
     "config_neopixel oid=17 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
 ];
 
-/// The same objects for a host of another generation, in its forms, and some objects that only it has.
-fn objects(generation: Generation) -> Vec<&'static str> {
+/// The same objects for a host of another dialect, in its forms, and some objects that only it has.
+fn objects(dialect: DialectName) -> Vec<&'static str> {
     let mut objects = OBJECTS.to_vec();
     let mut replace = |name: &str, by: &[&'static str]| {
         let at = objects.iter().position(|command| command.starts_with(name)).unwrap();
         objects.splice(at..=at, by.iter().copied());
     };
-    match generation {
+    match dialect {
         V0_11 => {
             replace("config_i2c ", &["config_i2c oid=10 i2c_bus=0 rate=400000 address=64"]);
             replace("i2c_set_bus ", &[]);
             replace("config_lis2dw ", &["config_mpu9250 oid=14 i2c_oid=10"]);
         }
         V0_12 => replace("config_lis2dw ", &["config_lis2dw oid=14 spi_oid=6", "config_mpu9250 oid=18 i2c_oid=10"]),
-        V0_13 => objects.push("config_ldc1612 oid=18 i2c_oid=10"),
+        V0_13 | Union => objects.push("config_ldc1612 oid=18 i2c_oid=10"),
         Master => objects
             .extend(["config_sos_filter oid=18 max_sections=2", "config_trigger_analog oid=19 sos_filter_oid=18"]),
         Kalico => {
@@ -122,17 +122,17 @@ proptest! {
 
     #[test]
     fn no_bytes_break_the_mcu(
-        generation in prop::sample::select(&Generation::ALL[..]),
+        dialect in prop::sample::select(&DialectName::ALL[..]),
         answer_ticks in 0u32..50_000,
         actions in vec(action(), 1..60),
     ) {
-        let mut rig = Rig::of(generation);
+        let mut rig = Rig::of(dialect);
         rig.bench.state().answer_ticks = answer_ticks;
         rig.bench.plug_i2c(0, 64, |_, _, _| Ok(()));
         rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
         rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
         rig.bench.script_ds18b20("28", &[Some(20_000), None, Some(-5000), None]);
-        rig.configure(&objects(generation));
+        rig.configure(&objects(dialect));
         for action in &actions {
             match action {
                 Action::Bytes(bytes) => rig.execute(bytes),
@@ -149,7 +149,7 @@ proptest! {
         prop_assert!(rig.ask("get_config").starts_with("config is_config="));
         rig.send_all(&["emergency_stop", "config_reset"]);
         rig.everything();
-        rig.configure(&objects(generation));
+        rig.configure(&objects(dialect));
         prop_assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
         // The MCU still works: a step comes on its tick.
         rig.edges(1);

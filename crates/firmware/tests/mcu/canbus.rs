@@ -3,14 +3,14 @@
 
 use std::sync::Arc;
 
-use pinion_firmware::mcu::{CanHealth, CanNode, CanState, Dialect, DialectName, Firmware, Generation, Wire};
+use pinion_firmware::mcu::{CanHealth, CanNode, CanState, Dialect, DialectName, Firmware, Wire};
 use pinion_firmware::time::{Clock, VirtualClock};
 use pinion_testbench::board::{Bench, FakeBoard};
 use pinion_testbench::rig::{FIRMWARE, Rig};
 
 fn dialect(wire: Wire) -> Dialect {
     let board = FakeBoard(Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH));
-    Dialect::new(&Firmware { wire, ..FIRMWARE }, &board, DialectName::Of(Generation::Master)).unwrap()
+    Dialect::new(&Firmware { wire, ..FIRMWARE }, &board, DialectName::Master).unwrap()
 }
 
 #[test]

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use pinion_firmware::mcu::Generation::{Kalico, Master, V0_13};
+use pinion_firmware::mcu::DialectName::{Kalico, Master, V0_13};
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::{Rig, hex};
@@ -29,8 +29,8 @@ fn a_ds18b20_may_ignore_its_limits() {
 
 #[test]
 fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_mcu() {
-    for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 1, true), (Master, 0, true)] {
-        let mut rig = Rig::of(generation);
+    for (dialect, count, ends) in [(Kalico, 0, false), (Kalico, 1, true), (Master, 0, true)] {
+        let mut rig = Rig::of(dialect);
         // The chip reports a fault, and the value is out of range.
         rig.bench.plug_spi(0, |_, bytes| bytes.fill(0xff));
         rig.configure(&[
@@ -41,15 +41,15 @@ fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_mcu() {
         let query = "query_thermocouple oid=1 clock=@1000 rest_ticks=10000 min_value=1 max_value=2 max_invalid_count=";
         rig.send(&format!("{query}{count}"));
         rig.run_until(50_000);
-        assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
+        assert_eq!(rig.mcu.is_shutdown(), ends, "{dialect} {count}");
         assert!(rig.responses()[0].starts_with("thermocouple_result "));
     }
 }
 
 #[test]
 fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_mcu() {
-    for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 2, true), (V0_13, 0, true)] {
-        let mut rig = Rig::of(generation);
+    for (dialect, count, ends) in [(Kalico, 0, false), (Kalico, 2, true), (V0_13, 0, true)] {
+        let mut rig = Rig::of(dialect);
         rig.configure(&["config_analog_in oid=0 pin=400"]);
         rig.bench.script_adc(ANALOG, &[4095; 20]);
         rig.send(&format!(
@@ -57,7 +57,7 @@ fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_mcu() {
              max_value=2 range_check_count={count}"
         ));
         rig.run_until(30_000);
-        assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
+        assert_eq!(rig.mcu.is_shutdown(), ends, "{dialect} {count}");
         if !ends {
             assert_eq!(rig.responses()[0], "analog_in_state oid=0 next_clock=@15000 value=8190");
         }

@@ -5,13 +5,13 @@
 use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::BusStatus;
-use pinion_firmware::mcu::Generation::{self, Kalico, V0_11, V0_12, V0_13};
+use pinion_firmware::mcu::DialectName::{self, Kalico, V0_11, V0_12, V0_13};
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::Rig;
 
-fn configured(generation: Generation, commands: &[&str]) -> Rig {
-    let mut rig = Rig::of(generation);
+fn configured(dialect: DialectName, commands: &[&str]) -> Rig {
+    let mut rig = Rig::of(dialect);
     rig.configure(commands);
     rig
 }
@@ -20,30 +20,30 @@ fn configured(generation: Generation, commands: &[&str]) -> Rig {
 
 #[test]
 fn each_sum_of_readings_is_a_report() {
-    for generation in [V0_11, V0_12, V0_13, Kalico] {
-        let mut rig = configured(generation, &["config_analog_in oid=0 pin=400"]);
+    for dialect in [V0_11, V0_12, V0_13, Kalico] {
+        let mut rig = configured(dialect, &["config_analog_in oid=0 pin=400"]);
         rig.bench.script_adc(ANALOG, &[4095, 4095, 4095, 4094, 1, 2, 3, 4, 2000]);
         rig.send(
             "query_analog_in oid=0 clock=@5000 sample_ticks=1000 sample_count=4 rest_ticks=100000 min_value=0 \
              max_value=7999 range_check_count=2",
         );
         rig.run_until(8000);
-        assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 value=16379"], "{generation}");
+        assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 value=16379"], "{dialect}");
         rig.run_until(108_000);
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@205000 value=10"]);
         // 8000 is out of range. The second value out of range in a row stops the MCU.
         rig.run_until(307_999);
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 value=8000"]);
         rig.run_until(308_000);
-        assert_eq!(rig.shutdown().as_deref(), Some("ADC out of range"), "{generation}");
+        assert_eq!(rig.shutdown().as_deref(), Some("ADC out of range"), "{dialect}");
     }
 }
 
 // ---- I2C
 
 /// The commands that make oid 0 the chip at 0x48 of bus 1.
-fn device(generation: Generation) -> &'static [&'static str] {
-    match generation {
+fn device(dialect: DialectName) -> &'static [&'static str] {
+    match dialect {
         V0_11 => &["config_i2c oid=0 i2c_bus=1 rate=400000 address=72"],
         _ => &["config_i2c oid=0", "i2c_set_bus oid=0 i2c_bus=1 rate=400000 address=72"],
     }
@@ -68,10 +68,10 @@ fn plug_i2c(rig: &Rig, after: usize, status: Result<(), BusStatus>) -> Heard {
 
 #[test]
 fn registers_are_written_and_read_without_a_status() {
-    for generation in [V0_11, V0_12, V0_13, Kalico] {
-        let mut rig = configured(generation, device(generation));
+    for dialect in [V0_11, V0_12, V0_13, Kalico] {
+        let mut rig = configured(dialect, device(dialect));
         let heard = plug_i2c(&rig, 0, Ok(()));
-        assert_eq!(rig.ask("i2c_write oid=0 data=1020"), "", "{generation}");
+        assert_eq!(rig.ask("i2c_write oid=0 data=1020"), "", "{dialect}");
         assert_eq!(rig.ask("i2c_read oid=0 reg=10 read_len=3"), "i2c_read_response oid=0 response=101112");
         assert_eq!(rig.ask("i2c_read oid=0 reg= read_len=2"), "i2c_read_response oid=0 response=a0a1");
         assert_eq!(*heard.lock().unwrap(), [(vec![0x10, 0x20], 0), (vec![0x10], 3), (vec![], 2)]);
@@ -81,8 +81,8 @@ fn registers_are_written_and_read_without_a_status() {
 
 #[test]
 fn bits_of_registers_are_cleared_and_set() {
-    for generation in [V0_11, V0_12] {
-        let mut rig = configured(generation, device(generation));
+    for dialect in [V0_11, V0_12] {
+        let mut rig = configured(dialect, device(dialect));
         let heard = plug_i2c(&rig, 0, Ok(()));
         // Two registers, which read 0x35 and 0x36: clear f0 and 02, set 80 and 01.
         assert_eq!(rig.ask("i2c_modify_bits oid=0 reg=35 clear_set_bits=f0028001"), "");
@@ -100,7 +100,7 @@ fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
     const WRITE: &str = "i2c_write oid=0 data=1020";
     const READ: &str = "i2c_read oid=0 reg=10 read_len=1";
     const MODIFY: &str = "i2c_modify_bits oid=0 reg=10 clear_set_bits=0101";
-    for (generation, command, status, text) in [
+    for (dialect, command, status, text) in [
         (V0_11, WRITE, StartNack, "Unable write i2c device"),
         (V0_12, WRITE, Nack, "Unable write i2c device"),
         (V0_11, READ, StartReadNack, "Unable to read i2c device"),
@@ -113,12 +113,12 @@ fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
         (V0_13, READ, StartReadNack, "I2C START READ NACK"),
         (Kalico, READ, Timeout, "I2C Timeout"),
     ] {
-        let mut rig = configured(generation, device(generation));
+        let mut rig = configured(dialect, device(dialect));
         let heard = plug_i2c(&rig, 0, Err(status));
         rig.send(command);
         let responses = rig.responses();
         assert_eq!(responses.len(), 1, "no answer: {responses:?}");
-        assert!(responses[0].ends_with(&format!("static_string_id={text}")), "{generation} {command}: {responses:?}");
+        assert!(responses[0].ends_with(&format!("static_string_id={text}")), "{dialect} {command}: {responses:?}");
         // Only a transfer that writes nothing is retried.
         let tries = if command.contains("reg= ") { 3 } else { 1 };
         assert_eq!(heard.lock().unwrap().len(), tries);
@@ -137,9 +137,9 @@ fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
 
 #[test]
 fn lines_are_an_i2c_bus_of_100_khz_whatever_the_rate() {
-    for (generation, text) in [(V0_12, "soft_i2c NACK"), (V0_13, "I2C START NACK")] {
+    for (dialect, text) in [(V0_12, "soft_i2c NACK"), (V0_13, "I2C START NACK")] {
         let mut rig = configured(
-            generation,
+            dialect,
             &["config_i2c oid=0", "i2c_set_software_bus oid=0 scl_pin=50 sda_pin=51 rate=400000 address=72"],
         );
         rig.bench.script_input(50, &[(0, 1)]);
@@ -158,9 +158,9 @@ fn lines_are_an_i2c_bus_of_100_khz_whatever_the_rate() {
 
 #[test]
 fn lines_are_an_spi_bus_of_the_rate() {
-    for generation in [V0_11, V0_12, V0_13] {
+    for dialect in [V0_11, V0_12, V0_13] {
         let mut rig = configured(
-            generation,
+            dialect,
             &[
                 "config_spi oid=0 pin=40 cs_active_high=0",
                 "spi_set_software_bus oid=0 miso_pin=30 mosi_pin=31 sclk_pin=32 mode=0 rate=500000",
@@ -235,8 +235,8 @@ fn adxl345_data(sequence: u16, numbers: std::ops::Range<u8>) -> String {
 
 #[test]
 fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
-    for generation in [V0_11, V0_12] {
-        let mut rig = configured(generation, ADXL345);
+    for dialect in [V0_11, V0_12] {
+        let mut rig = configured(dialect, ADXL345);
         let chip = plug_adxl345(&rig);
         rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
         rig.run_until(4999);
@@ -244,14 +244,14 @@ fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
         rig.run_until(17_500);
         assert_eq!(chip.lock().unwrap().written, [(5000, [0x2d, 0x08])]);
         // Ten samples of five bytes. Two more were there at the last look, at 17000.
-        assert_eq!(rig.responses(), [adxl345_data(0, 0..10)], "{generation}");
+        assert_eq!(rig.responses(), [adxl345_data(0, 0..10)], "{dialect}");
         let status = "adxl345_status oid=1 clock=@17500 query_ticks=0 next_sequence=1 buffered=10 fifo=0 limit_count=0";
         assert_eq!(rig.ask("query_adxl345_status oid=1"), status);
         rig.run_until(20_000);
         rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
         assert_eq!(chip.lock().unwrap().written[1..], [(20_000, [0x2d, 0x00])]);
         let status = "adxl345_status oid=1 clock=@20000 query_ticks=0 next_sequence=2 buffered=0 fifo=0 limit_count=0";
-        assert_eq!(rig.responses(), [adxl345_data(1, 10..15), status.to_owned()], "{generation}");
+        assert_eq!(rig.responses(), [adxl345_data(1, 10..15), status.to_owned()], "{dialect}");
         rig.run_until(100_000);
         assert_eq!(rig.responses(), [""; 0], "it has ended");
         // The same once more, from the beginning.
@@ -345,8 +345,8 @@ fn a_lis2dw_on_spi_sends_messages_of_eight_samples() {
 
 #[test]
 fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
-    for generation in [V0_11, V0_12] {
-        let mut rig = Rig::of(generation);
+    for dialect in [V0_11, V0_12] {
+        let mut rig = Rig::of(dialect);
         let written: Heard = Arc::default();
         let log = written.clone();
         rig.bench.plug_i2c(1, 0x48, move |_, write, read| {
@@ -358,7 +358,7 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
             }
             Ok(())
         });
-        let config: Vec<&str> = device(generation).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
+        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
         rig.configure(&config);
         rig.send("query_mpu9250 oid=1 clock=@5000 rest_ticks=4000");
         rig.run_until(9000);
@@ -367,7 +367,7 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
         assert_eq!(rig.responses(), [format!("mpu9250_data oid=1 sequence=0 data={}", "22".repeat(48))]);
         let status = rig.ask("query_mpu9250 oid=1 clock=0 rest_ticks=0");
         let expected = "mpu9250_status oid=1 clock=@9000 query_ticks=0 next_sequence=1 buffered=0 fifo=8 limit_count=1";
-        assert_eq!(status, expected, "{generation}");
+        assert_eq!(status, expected, "{dialect}");
         assert_eq!(written.lock().unwrap().last(), Some(&(vec![0x23, 0], 0)));
     }
 }
@@ -377,8 +377,8 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
 #[test]
 fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
     const PERIOD: u64 = 12_500;
-    for generation in [V0_11, V0_12] {
-        let mut rig = Rig::of(generation);
+    for dialect in [V0_11, V0_12] {
+        let mut rig = Rig::of(dialect);
         rig.bench.state().byte_ticks = 1125;
         let taken: Arc<Mutex<u64>> = Arc::default();
         let began: Arc<Mutex<u64>> = Arc::default();
@@ -396,7 +396,7 @@ fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
             }
             Ok(())
         });
-        let config: Vec<&str> = device(generation).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
+        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
         rig.configure(&config);
         rig.send(&format!("query_mpu9250 oid=1 clock=@5000 rest_ticks={}", 4 * PERIOD));
         let number = |status: &str, name: &str| {
@@ -417,17 +417,17 @@ fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
 
 #[test]
 fn a_sensor_whose_bus_fails_stops_the_mcu_in_the_words_of_its_time() {
-    for (generation, query, text) in [
+    for (dialect, query, text) in [
         (V0_11, "query_mpu9250 oid=1 clock=@5000 rest_ticks=4000", "Unable to read i2c device"),
         (V0_12, "query_mpu9250 oid=1 clock=@5000 rest_ticks=4000", "Unable to read i2c device"),
         (V0_13, "query_mpu9250 oid=1 rest_ticks=4000", "I2C NACK"),
     ] {
-        let config: Vec<&str> = device(generation).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
-        let mut rig = configured(generation, &config);
+        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
+        let mut rig = configured(dialect, &config);
         plug_i2c(&rig, 0, Err(BusStatus::Nack));
         rig.send(query);
         rig.run_until(20_000);
-        assert_eq!(rig.shutdown().as_deref(), Some(text), "{generation}");
+        assert_eq!(rig.shutdown().as_deref(), Some(text), "{dialect}");
     }
 }
 
@@ -512,9 +512,9 @@ fn an_mcu_that_stops_amid_a_measurement_measures_no_more() {
 
 #[test]
 fn an_angle_sensor_sends_sixteen_entries_a_message_and_its_end() {
-    for generation in [V0_11, V0_12] {
+    for dialect in [V0_11, V0_12] {
         let mut rig = configured(
-            generation,
+            dialect,
             &[
                 "config_spi oid=0 pin=40 cs_active_high=0",
                 "config_spi_angle oid=1 spi_oid=0 spi_angle_type=0",
@@ -528,7 +528,7 @@ fn an_angle_sensor_sends_sixteen_entries_a_message_and_its_end() {
             |sequence, entries| format!("spi_angle_data oid=1 sequence={sequence} data={}", "000080".repeat(entries));
         assert_eq!(rig.responses(), [data(0, 16)]);
         rig.send("query_spi_angle oid=1 clock=0 rest_ticks=0 time_shift=0");
-        assert_eq!(rig.responses(), [data(1, 3), "spi_angle_end oid=1 sequence=2".into()], "{generation}");
+        assert_eq!(rig.responses(), [data(1, 3), "spi_angle_end oid=1 sequence=2".into()], "{dialect}");
         let types = rig.dictionary().enumerations["spi_angle_type"].as_object().unwrap();
         assert_eq!(types.keys().collect::<Vec<_>>(), ["a1333", "as5047d", "tle5012b"]);
     }
@@ -537,9 +537,9 @@ fn an_angle_sensor_sends_sixteen_entries_a_message_and_its_end() {
 // ---- the eddy current probe
 
 /// An LDC1612 that always has a sample, with the value that the mutex holds, or fails.
-fn ldc1612(generation: Generation) -> (Rig, Arc<Mutex<Result<u32, BusStatus>>>) {
+fn ldc1612(dialect: DialectName) -> (Rig, Arc<Mutex<Result<u32, BusStatus>>>) {
     let rig = configured(
-        generation,
+        dialect,
         &[
             "config_i2c oid=0",
             "i2c_set_bus oid=0 i2c_bus=1 rate=400000 address=72",
@@ -567,8 +567,8 @@ const SETUP: &str = "ldc1612_setup_home oid=1 clock=@50000 threshold=2000 trsync
 
 #[test]
 fn an_eddy_current_probe_triggers_above_its_threshold() {
-    for generation in [V0_13, Kalico] {
-        let (mut rig, value) = ldc1612(generation);
+    for dialect in [V0_13, Kalico] {
+        let (mut rig, value) = ldc1612(dialect);
         rig.send_all(&[
             "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
             SETUP,
@@ -584,15 +584,15 @@ fn an_eddy_current_probe_triggers_above_its_threshold() {
         rig.run_until(95_000);
         let responses = rig.responses();
         let trigger = "trsync_state oid=2 can_trigger=0 trigger_reason=1 clock=@80000";
-        assert!(responses.iter().any(|response| response == trigger), "{generation}: {responses:?}");
+        assert!(responses.iter().any(|response| response == trigger), "{dialect}: {responses:?}");
         assert_eq!(rig.ask("query_ldc1612_home_state oid=1"), "ldc1612_home_state oid=1 homing=0 trigger_clock=@80000");
     }
 }
 
 #[test]
 fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_silent_the_mcu() {
-    for generation in [V0_13, Kalico] {
-        let (mut rig, value) = ldc1612(generation);
+    for dialect in [V0_13, Kalico] {
+        let (mut rig, value) = ldc1612(dialect);
         rig.send_all(&[
             "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
             SETUP,
@@ -602,7 +602,7 @@ fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_
         *value.lock().unwrap() = Ok(0x1000_0000);
         rig.run_until(15_000);
         let state = rig.responses().pop().unwrap();
-        assert!(state.starts_with("trsync_state oid=2 can_trigger=0 trigger_reason=3 "), "{generation}: {state}");
+        assert!(state.starts_with("trsync_state oid=2 can_trigger=0 trigger_reason=3 "), "{dialect}: {state}");
         assert_eq!(rig.ask("query_ldc1612_home_state oid=1"), "ldc1612_home_state oid=1 homing=0 trigger_clock=@50000");
         // Master reports this as INVALID_READ_DATA. Here it is an ordinary sample.
         *value.lock().unwrap() = Ok(0xffff_1234);
@@ -611,7 +611,7 @@ fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_
         assert!(data.ends_with("ffff1234"), "{data}");
         *value.lock().unwrap() = Err(BusStatus::StartNack);
         rig.run_until(135_000);
-        assert_eq!(rig.shutdown().as_deref(), Some("I2C START NACK"), "{generation}");
+        assert_eq!(rig.shutdown().as_deref(), Some("I2C START NACK"), "{dialect}");
     }
 }
 

@@ -498,7 +498,7 @@ mod tests {
     use crate::core::workers::Threads;
     use crate::process::realtime::{Processors, Scheduling};
     use crate::status;
-    use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox};
+    use pinion_firmware::mcu::{DialectName, Note, Outbox};
     use pinion_firmware::time::{Timing, VirtualClock};
     use pinion_linux::clock::Monotonic;
     use pinion_protocol::vlq::Writer;
@@ -551,7 +551,7 @@ mod tests {
         fn new() -> Rig {
             let bench = Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
             let board = FakeBoard(bench.clone());
-            let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master)).unwrap());
+            let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Master).unwrap());
             let monotonic = Monotonic::start();
             let clock = Arc::new(Counting(monotonic, AtomicUsize::new(0)));
             let (requests, inbox) = RingBuffer::new(64);
@@ -847,7 +847,7 @@ mod tests {
     fn the_stop_of_a_host_that_came_meanwhile_is_read_in_its_dialect() {
         let mut rig = Rig::held();
         let board = FakeBoard(rig.bench.clone());
-        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::V0_11)).unwrap());
+        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::V0_11).unwrap());
         rig.request(Request::Speak(dialect.clone()));
         let stop = rig.encode("emergency_stop", &[]);
         let formats = dialect.dictionary().commands.keys().filter(|format| !format.contains('*'));

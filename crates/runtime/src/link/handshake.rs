@@ -11,7 +11,7 @@ use std::time::Duration;
 use log::warn;
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Wire};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Wire};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
@@ -68,7 +68,7 @@ impl Handshake {
     ) -> Result<Handshake, Trouble> {
         let names = match only {
             Some(name) => vec![name],
-            None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
+            None => iter::once(DialectName::Union).chain(DialectName::OF_HOSTS).collect(),
         };
         let firmware = Firmware { wire, ..FIRMWARE };
         let dialects = survey::dialects(&firmware, board, &names)?;

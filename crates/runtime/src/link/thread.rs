@@ -426,14 +426,14 @@ impl LinkThread {
 mod tests {
     use super::*;
     use crate::FIRMWARE;
-    use pinion_firmware::mcu::{DialectName, Generation};
+    use pinion_firmware::mcu::DialectName;
     use pinion_firmware::time::VirtualClock;
     use pinion_testbench::board::{Bench, FakeBoard};
 
     #[test]
     fn the_link_answers_a_question_that_is_alone_in_its_block() {
         let board = FakeBoard(Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH));
-        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master)).unwrap());
+        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Master).unwrap());
         let known = Known::new(dialect.clone());
         let answer = |commands: &[(&str, &[u32])]| {
             let mut block = Writer::default();

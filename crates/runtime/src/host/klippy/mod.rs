@@ -9,7 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use pinion_firmware::mcu::{Feature, Generation, Generations};
+use pinion_firmware::mcu::{DialectName, Dialects, Feature};
 use pinion_linux::foreign;
 
 pub mod process;
@@ -35,10 +35,10 @@ pub fn is_host_path(path: &Path) -> bool {
     path.to_str().and_then(|path| path.strip_prefix(HOST_PATHS)).is_some_and(|name| name.chars().all(is_plain))
 }
 
-/// A message that an MCU knows, and the generations that have it.
+/// A message that an MCU knows, and the dialects that have it.
 struct KnownShape {
     shape: Shape,
-    generations: Generations,
+    dialects: Dialects,
 }
 
 /// Facts about the host that runs from a checkout.
@@ -54,18 +54,18 @@ pub struct Checkout {
     pub unread: Option<String>,
     /// Every message that the host looks up.
     pub shapes: BTreeSet<Shape>,
-    /// The verdict on each generation, in the order of [`Generation::ALL`].
+    /// The verdict on each dialect, in the order of [`DialectName::OF_HOSTS`].
     pub verdicts: Vec<Verdict>,
 }
 
-/// How a generation's dialect suits a host.
+/// How a dialect suits a host.
 #[derive(Debug)]
 pub struct Verdict {
-    /// The generation.
-    pub generation: Generation,
+    /// The dialect.
+    pub dialect: DialectName,
     /// Messages in the form that the dialect has.
     pub served: BTreeSet<Shape>,
-    /// Messages in a form that the dialect does not have. Another generation's dialect may have it. A host often looks
+    /// Messages in a form that the dialect does not have. Another dialect may have it. A host often looks
     /// up several forms of one message, and takes the one that exists.
     pub other: BTreeSet<Shape>,
 }
@@ -84,12 +84,12 @@ impl Checkout {
         if ours.len() < SHAPES_MIN {
             return Err(io::Error::other(unread.unwrap_or_else(|| "it does not hold klippy's sources".into())));
         }
-        let verdict = |generation| {
-            let known = known.iter().filter(|known| known.generations.contains(generation));
+        let verdict = |dialect| {
+            let known = known.iter().filter(|known| known.dialects.contains(dialect));
             let known: BTreeSet<&Shape> = known.map(|known| &known.shape).collect();
             let (served, other): (BTreeSet<&Shape>, _) = ours.iter().partition(|shape| known.contains(*shape));
             let owned = |shapes: BTreeSet<&Shape>| shapes.into_iter().cloned().collect();
-            Verdict { generation, served: owned(served), other: owned(other) }
+            Verdict { dialect, served: owned(served), other: owned(other) }
         };
         let folder = klippy.parent().unwrap_or(klippy).to_owned();
         Ok(Checkout {
@@ -97,7 +97,7 @@ impl Checkout {
             folder,
             newest,
             unread,
-            verdicts: Generation::ALL.into_iter().map(verdict).collect(),
+            verdicts: DialectName::OF_HOSTS.into_iter().map(verdict).collect(),
             shapes,
         })
     }
@@ -107,11 +107,11 @@ impl Checkout {
         let best = self.verdicts.iter().rev().min_by_key(|verdict| verdict.other.len());
         match best {
             Some(verdict) => verdict,
-            None => unreachable!("there is a verdict for each generation"),
+            None => unreachable!("there is a verdict for each dialect"),
         }
     }
 
-    /// Messages that no generation has in this form, though it knows their names. The host is newer than all that this
+    /// Messages that no dialect has in this form, though it knows their names. The host is newer than all that this
     /// program knows, and these messages will not be served.
     pub fn unknown(&self) -> impl Iterator<Item = &Shape> {
         let everywhere = |shape: &&Shape| self.verdicts.iter().all(|verdict| verdict.other.contains(*shape));
@@ -122,12 +122,12 @@ impl Checkout {
 /// The messages that have parameters. A message without parameters is only a word in a host's sources.
 fn known(features: &[Feature]) -> Vec<KnownShape> {
     let commands = features.iter().flat_map(|feature| feature.commands);
-    let commands = commands.map(|command| (command.format, command.generations));
+    let commands = commands.map(|command| (command.format, command.dialects));
     let responses = features.iter().flat_map(|feature| feature.responses);
-    let responses = responses.map(|form| (form.format, form.generations));
+    let responses = responses.map(|form| (form.format, form.dialects));
     commands
         .chain(responses)
-        .filter_map(|(format, generations)| Some(KnownShape { shape: Shape::of(format)?, generations }))
+        .filter_map(|(format, dialects)| Some(KnownShape { shape: Shape::of(format)?, dialects }))
         .collect()
 }
 
@@ -171,42 +171,42 @@ mod tests {
         (folder, klippy)
     }
 
-    /// The messages that a generation's MCUs know.
-    fn forms(generation: Generation) -> Vec<String> {
-        let known = known(FEATURES).into_iter().filter(|known| known.generations.contains(generation));
+    /// The messages that a dialect's MCUs know.
+    fn forms(dialect: DialectName) -> Vec<String> {
+        let known = known(FEATURES).into_iter().filter(|known| known.dialects.contains(dialect));
         known.map(|known| known.shape.as_str().to_owned()).collect()
     }
 
     #[test]
     fn a_host_speaks_the_dialect_that_has_what_it_looks_up() {
-        for generation in Generation::ALL {
-            let (_folder, klippy) = checkout(forms(generation));
+        for dialect in DialectName::OF_HOSTS {
+            let (_folder, klippy) = checkout(forms(dialect));
             let checkout = Checkout::read(&klippy, FEATURES).unwrap();
-            assert_eq!(checkout.best().generation, generation);
-            assert_eq!(checkout.best().other.len(), 0, "{generation}");
+            assert_eq!(checkout.best().dialect, dialect);
+            assert_eq!(checkout.best().other.len(), 0, "{dialect}");
             assert_eq!(checkout.unknown().count(), 0);
         }
     }
 
     #[test]
     fn a_host_may_look_up_what_older_mcus_have_too() {
-        let older = forms(Generation::V0_13);
-        let (_folder, klippy) = checkout(forms(Generation::Master).into_iter().chain(older));
+        let older = forms(DialectName::V0_13);
+        let (_folder, klippy) = checkout(forms(DialectName::Master).into_iter().chain(older));
         let checkout = Checkout::read(&klippy, FEATURES).unwrap();
-        assert_eq!(checkout.best().generation, Generation::Master);
+        assert_eq!(checkout.best().dialect, DialectName::Master);
         assert!(checkout.best().other.iter().any(|shape| shape.name() == "i2c_write"));
-        assert_eq!(checkout.unknown().count(), 0, "another generation has it");
+        assert_eq!(checkout.unknown().count(), 0, "another dialect has it");
     }
 
     #[test]
     fn of_a_newer_host_what_will_not_be_served_is_named() {
-        let newer = forms(Generation::Master).into_iter().map(|shape| match shape.as_str() {
+        let newer = forms(DialectName::Master).into_iter().map(|shape| match shape.as_str() {
             "query_adxl345 oid rest_ticks" => "query_adxl345 oid rest_ticks range".to_owned(),
             _ => shape,
         });
         let (_folder, klippy) = checkout(newer.chain(["config_new_chip oid bus_oid".to_owned()]));
         let checkout = Checkout::read(&klippy, FEATURES).unwrap();
-        assert_eq!(checkout.best().generation, Generation::Master);
+        assert_eq!(checkout.best().dialect, DialectName::Master);
         let unknown: Vec<&str> = checkout.unknown().map(Shape::as_str).collect();
         assert_eq!(unknown, ["query_adxl345 oid rest_ticks range"]);
     }
@@ -275,15 +275,15 @@ mod tests {
     /// With checkouts of real hosts in KLIPPER_DIR_V0_11 and so on.
     #[test]
     fn real_hosts_are_told_apart() {
-        for generation in Generation::ALL {
-            let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
+        for dialect in DialectName::OF_HOSTS {
+            let variable = format!("KLIPPER_DIR_{}", dialect.name().to_uppercase().replace('.', "_"));
             let Some(folder) = std::env::var_os(&variable) else {
-                eprintln!("SKIPPED {generation}: {variable} is not set");
+                eprintln!("SKIPPED {dialect}: {variable} is not set");
                 continue;
             };
             let checkout = Checkout::read(&Path::new(&folder).join("klippy"), FEATURES).unwrap();
-            assert_eq!(checkout.best().generation, generation);
-            assert_eq!(checkout.unknown().count(), 0, "{generation}: {:?}", checkout.best().other);
+            assert_eq!(checkout.best().dialect, dialect);
+            assert_eq!(checkout.unknown().count(), 0, "{dialect}: {:?}", checkout.best().other);
         }
     }
 }

@@ -210,7 +210,7 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) 
         if host.is_sure { "" } else { "probably the " },
         inside.display(),
         checkout.commit.as_ref().map_or(String::new(), |commit| format!(" ({commit})")),
-        best.generation,
+        best.dialect,
         best.served.len(),
         best.served.len() + best.other.len(),
         began.elapsed().as_millis(),
@@ -227,7 +227,7 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) 
     if started(process).is_some_and(|started| started < checkout.newest) {
         say.warn(format!("the host's sources are newer than its process {pid}: restart klipper, so that both are one"));
     }
-    Some(DialectName::Of(best.generation))
+    Some(best.dialect)
 }
 
 /// When a process was started, in wall-clock time.

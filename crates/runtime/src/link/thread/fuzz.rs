@@ -14,7 +14,7 @@ use nix::unistd::getegid;
 use rtrb::{Consumer, RingBuffer};
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox as _};
+use pinion_firmware::mcu::{DialectName, Note, Outbox as _};
 use pinion_firmware::time::VirtualClock;
 use pinion_linux::clock::Monotonic;
 use pinion_protocol::block::{BLOCK_MAX, Found, PAYLOAD_MAX, Received, Receiver, Resync, Sequence, frame};
@@ -49,7 +49,7 @@ fn clock() -> Arc<VirtualClock> {
 /// Lets a host and a core of this board do what `bytes` say.
 pub fn link(mut bytes: &[u8], board: impl FnOnce(Arc<VirtualClock>) -> Box<dyn Board>) {
     let once = ONCE.get_or_init(|| {
-        let dialect = Dialect::new(&crate::FIRMWARE, &*board(clock()), DialectName::Of(Generation::Master));
+        let dialect = Dialect::new(&crate::FIRMWARE, &*board(clock()), DialectName::Master);
         (Arc::new(dialect.expect("a dictionary")), Heartbeat::new(Monotonic::start()).expect("a page"))
     });
     let mut bench = Bench::new(once);
