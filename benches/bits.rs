@@ -639,7 +639,7 @@ fn stand_stills(clock: Monotonic, end: &AtomicBool, gaps: &Mutex<Vec<(Clock, Clo
     }
 }
 
-/// What became of messages.
+/// Outcomes of messages.
 #[derive(Default)]
 struct Counts {
     /// Messages that a driver did not understand at the first try while a processor without work was interrupted, too.

@@ -5,7 +5,7 @@
 use std::env;
 use std::process::Command;
 
-/// What the program is made of.
+/// The sources of the program.
 const SOURCES: [&str; 4] = ["../../src", "../../crates", "../../Cargo.toml", "../../Cargo.lock"];
 
 /// Where the sources are not a checkout of git, as when a package is built, whoever gives them may say

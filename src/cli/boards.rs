@@ -92,7 +92,8 @@ impl Board {
         tree
     }
 
-    /// What Pinion finds there. Only the kernel tells a chip's label and number of lines, so they are not read.
+    /// The chips that Pinion finds there. Only the kernel knows a chip's label and number of lines, so they are not
+    /// read.
     pub(super) fn inventory(&self, tree: &Tree) -> Inventory {
         let computer = tree.computer();
         let chip = |chip: &BoardChip| {

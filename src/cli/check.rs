@@ -89,7 +89,7 @@ fn board(settings: &Settings, simulated: Open) -> Vec<Finding> {
     findings
 }
 
-/// Whether the chips that never sleep have registers for fast lines. With `auto` only those that have some are told.
+/// Whether the chips that never sleep have registers for fast lines. With `auto` only those that have some are listed.
 fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
     let native = chips.iter().filter(|chip| !chip.sleeps);
     let found = native.filter_map(|chip| match (wish, chip.registers(wish)) {

@@ -21,7 +21,7 @@ pub(super) const SYSTEM_FILE: &str = "/etc/pinion/pinion.toml";
 /// Longest configuration.
 const CONFIG_MIB: u64 = 1;
 
-/// What to do about a line that is no TOML.
+/// The remedy for a line that is no TOML.
 const LINE: &str = "write a key, = and its value, such as realtime = true";
 
 /// A key of the file.
@@ -46,7 +46,7 @@ impl Key {
     }
 }
 
-/// The key whose value is not TOML, such as `mode = 0660`. It tells more than the parser.
+/// The key whose value is not TOML, such as `mode = 0660`. This says more than the parser.
 fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
     let before = text.get(..mistake?.start)?;
     let (name, _) = before.rsplit('\n').next()?.split_once('=')?;

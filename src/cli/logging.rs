@@ -142,7 +142,7 @@ impl Queue {
         }
     }
 
-    /// The next line to write. After the last one comes a line that tells how many lines were lost.
+    /// The next line to write. After the last one comes a line with the number of lost lines.
     fn pop(&mut self, style: Style) -> Option<String> {
         self.lines.pop_front().or_else(|| {
             let lost = std::mem::take(&mut self.lost);

@@ -46,7 +46,7 @@ mod trace;
 use page::{Page, print};
 use simulator::take_over;
 
-/// What the targets in `fuzz/` call.
+/// The functions for the targets in `fuzz/`.
 #[cfg(fuzzing)]
 pub mod fuzz {
     pub use super::config::config;
@@ -68,7 +68,7 @@ pub(crate) struct Cli {
     log: LogArgs,
 }
 
-/// What goes to the log (stderr).
+/// The level of the log (stderr).
 #[derive(Args, Debug, Clone)]
 pub struct LogArgs {
     /// How much to log: error, warn, info, debug, trace or off [default: info]

@@ -140,7 +140,7 @@ struct GpioLine {
     direction: &'static str,
     /// Whether a driver or a program has it.
     held: bool,
-    /// Its holder, as far as the kernel tells.
+    /// Its holder, as far as the kernel knows.
     consumer: Option<String>,
     /// The device that the pin is switched to.
     device: Option<String>,
@@ -174,7 +174,7 @@ struct AdcDevice {
 #[derive(Debug, Serialize)]
 struct AdcChannel {
     channel: String,
-    /// `None` if the driver does not tell it.
+    /// `None` if the driver does not report it.
     resolution: Option<String>,
     reading: Reading,
     pins: Vec<String>,
@@ -237,7 +237,7 @@ struct SerialEntry {
 
 impl List {
     /// The wanted part of everything that was found. `reading` reads a channel (its driver's name) of a device (its
-    /// number). `fast` tells the node of a chip's registers.
+    /// number). `fast` returns the node of a chip's registers.
     fn new(
         inventory: &Inventory,
         sysfs: &Sysfs,

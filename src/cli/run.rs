@@ -74,8 +74,8 @@ impl RunArgs {
     }
 }
 
-/// Serves until SIGTERM, SIGINT or SIGHUP. With `--check` it only tells whether that is possible. A simulated board is made
-/// by `simulated`. `log_level` is the command line's.
+/// Serves until SIGTERM, SIGINT or SIGHUP. With `--check` it only reports whether that is possible. A simulated board
+/// is made by `simulated`. `log_level` is the command line's.
 pub fn run(args: &RunArgs, log_level: Option<LevelFilter>, simulated: Open) -> ExitCode {
     let settings = match args.settings(log_level) {
         Ok(settings) => settings,

@@ -29,7 +29,7 @@ pub(super) const WATCHDOG_REMEDY: &str =
 /// Highest margin that may be asked for.
 pub(super) const MARGIN_MAX_US: u32 = 10_000;
 
-/// What the command line or the configuration file says, as far as it says anything.
+/// The settings that the command line or the configuration file gives.
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub(super) struct Given {
     /// Path of the symbolic link that the host opens; it leads to the pty [default: /tmp/klipper_host_mcu]

@@ -79,7 +79,7 @@ pub fn status(bytes: &[u8]) {
         let page = show(&status).to_string();
         assert!(!page.contains(|c: char| c.is_control() && c != '\n'), "{page:?}");
     }
-    // What is read is written, and read as the same.
+    // A status that is read, written and read again is the same.
     let again = pinion_runtime::status::form::read(json(&status).to_string().as_bytes());
     assert_eq!(again.map(|(again, _)| again).ok(), Some(status));
 }

@@ -328,7 +328,7 @@ mod tests {
     fn whatever_ends_the_program_the_terminal_is_as_before() {
         for (end, code, signal) in [("drop", Some(0), None), ("panic", Some(3), None), ("signal", None, Some(15))] {
             let pty = openpty(None, None).unwrap();
-            // The master end tells the slave's settings. It cannot be read when no slave end is open.
+            // The master end has the slave's settings. It cannot be read when no slave end is open.
             let before = tcgetattr(&pty.master).unwrap();
             let mut child = Command::new(std::env::current_exe().unwrap())
                 .args(["--ignored", "--exact", "--nocapture", "cli::terminal::tests::taking"])

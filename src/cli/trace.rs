@@ -127,7 +127,7 @@ fn list(args: &TraceArgs) -> Result<(), String> {
     print(&Page::text(&aligned(&rows).join("\n")))
 }
 
-/// A line of the list. A path has no line feed, because `plain` would not tell it from ours.
+/// A line of the list. A path has no line feed, because `plain` could not distinguish it from ours.
 fn row(path: &Path) -> Vec<String> {
     let cells = match read(path) {
         Ok(trace) => [utc_text(trace.head.utc_ms), verdict(&trace).text],

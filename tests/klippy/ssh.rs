@@ -85,7 +85,7 @@ fn klippy_prints_over_ssh_and_returns_after_the_connection_was_lost() {
     assert!(log.contains("round trip to toolhead: "), "{log}");
 }
 
-/// What klippy lives with: a table of round trips and results.
+/// The delays that klippy tolerates: a table of round trips and results.
 ///
 /// `PINION_SSH_MS="none 0+0 5+0 20+10"` has the round trips, each with the jitter of one direction. `none` is a pty
 /// without `pinion link`: what fails there is this computer's fault.

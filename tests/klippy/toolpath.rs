@@ -21,7 +21,7 @@ fn part() -> String {
     part + "G1 X60 Y33 Z5 F6000\n"
 }
 
-/// What the comparison says.
+/// The result of the comparison.
 struct Said {
     code: Option<i32>,
     /// Its output and its log.

@@ -418,7 +418,7 @@ fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
     assert_eq!(card.read("root/kept"), "root's\n");
 }
 
-/// What a disk without room does to a write: the kernel refuses it.
+/// A write to a disk without room: the kernel refuses it.
 #[test]
 fn a_full_disk_leaves_the_old_files() {
     let card = Card::pi();

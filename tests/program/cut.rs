@@ -30,7 +30,7 @@ struct Wire {
     mcu: Pinion,
     host: Client,
     cut: Cut,
-    /// What the verdict says, if it stops a heater.
+    /// The verdict, if it stops a heater.
     verdict: &'static str,
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the package does before it is unpacked.
+//! The package's script that runs before it is unpacked.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;

@@ -156,7 +156,7 @@ fn a_running_program_gives_its_recording() {
     assert!(page.contains("\nrecorder  up to "), "{page}");
 }
 
-/// What explains a host's "retransmit" and "Lost communication".
+/// Causes of a host's "retransmit" and "Lost communication".
 #[test]
 fn the_links_answers_and_what_it_refuses_are_recorded() {
     let pinion = Pinion::simulated(&[]);

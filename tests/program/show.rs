@@ -74,7 +74,7 @@ fn show(folder: &TempDir) -> (AtTerminal, PathBuf) {
 fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
     let folder = tempfile::tempdir().unwrap();
     let (mut pinion, link) = show(&folder);
-    // A host is told how to connect as soon as it can.
+    // The command to connect is printed as soon as a host can connect.
     pinion.until("--print-config > printer.cfg");
     let client = drive(&link);
     // The colors themselves.

@@ -100,7 +100,7 @@ impl fmt::Display for Row {
     }
 }
 
-/// What the hosts have seen.
+/// The hosts' observations.
 #[derive(Debug, Default)]
 struct Tally {
     hosts: u32,

@@ -134,7 +134,7 @@ fn what_is_wrong_is_one_line_with_a_remedy() {
     refused.logged("connected to");
     port.queue_block(&[1, 0, 40], Default::default());
     assert!(port.wait_block(Instant::now() + WAIT_MAX).unwrap().is_some());
-    // The same failure was told once.
+    // The same failure was logged once.
     assert_eq!(refused.log().matches("Permission denied").count(), 1, "{}", refused.log());
 }
 

@@ -279,7 +279,7 @@ fn a_running_pinion_is_asked_for_the_last_seconds() {
     let server = thread::spawn(move || listener.accept().unwrap().0.write_all(&bytes(&working())).unwrap());
     let shown = out(&trace(folder.path(), &args));
     server.join().unwrap();
-    // What was late before is not told.
+    // Earlier late events are not reported.
     assert!(shown.starts_with("verdict: nobody was late; the core was never later than 0.1 ms\n"), "{shown}");
 
     let refused = trace(folder.path(), &["--live", "60"]);

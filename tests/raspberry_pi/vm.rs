@@ -51,7 +51,7 @@ pub enum News {
     Done,
 }
 
-/// What a VM is made of.
+/// The parts of a VM.
 pub struct Parts<'a> {
     pub board: &'static Board,
     pub emulator: &'a Emulator,
@@ -186,7 +186,7 @@ impl Vm {
         }
     }
 
-    /// What the emulator has used.
+    /// The emulator's use of processor time.
     fn processor_time(&self) -> Result<Duration, String> {
         let process = Pid::from_raw(self.qemu.id().cast_signed());
         let time = ClockId::pid_cpu_clock_id(process).and_then(ClockId::now);

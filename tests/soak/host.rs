@@ -415,7 +415,7 @@ impl Host {
         self.rests = false;
     }
 
-    /// Compares the positions that the MCU tells with the printer's.
+    /// Compares the positions that the MCU reports with the printer's.
     pub fn compare(&mut self, printer: &mut Printer) {
         for (axis, (name, _)) in AXES.iter().enumerate() {
             let told = self.position(printer, axis);

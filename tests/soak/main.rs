@@ -75,7 +75,7 @@ faults! {
     LongStall,
 }
 
-/// What a fault does to the MCU.
+/// The effect of a fault on the MCU.
 enum Effect {
     /// It stops with one of these texts.
     Stops(&'static [&'static str]),
@@ -162,7 +162,7 @@ impl Fault {
     }
 }
 
-/// A day, and what it is told by.
+/// A day, with the report of it.
 struct Day {
     printer: Printer,
     /// How often each fault came, and how often the MCU stopped.

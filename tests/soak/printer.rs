@@ -30,7 +30,7 @@ const STORY: usize = 40;
 /// The axes of the default printer, with their steps per millimeter.
 pub const AXES: [(&str, f64); 4] = [("x", 80.0), ("y", 80.0), ("z", 400.0), ("extruder", 100.0)];
 
-/// What the day was made of.
+/// The parts of the day.
 #[derive(Debug, Default)]
 pub struct Tally {
     pub commands: u64,

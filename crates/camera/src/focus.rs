@@ -26,7 +26,7 @@ const PAUSE_S: f64 = 20.0;
 pub struct Focus {
     /// Where filament can be laid.
     stage: Room,
-    /// What was laid in the last band of heights, and in the one below it.
+    /// The pieces in the last band of heights, and in the one below it.
     band: Option<Room>,
     below: Option<Room>,
     /// The height at which the last band began.

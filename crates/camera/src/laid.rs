@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What was laid: each piece is drawn once, and stays. So a picture costs the same after ten hours of printing.
+//! The laid filament: each piece is drawn once, and stays. So a picture costs the same after ten hours of printing.
 //!
 //! The order in which pieces are laid is the right order of drawing. The eye is above the room. So on each line of sight
 //! a higher piece is in front of a lower one, and pieces of one height never hide each other. It is wrong only for

@@ -22,7 +22,7 @@ const BLOCK: Rgb = [168, 172, 180];
 const NOZZLE: Rgb = [212, 172, 72];
 const GLOWING: Rgb = [255, 96, 32];
 const BELTS: [Rgb; 2] = [[86, 156, 255], [255, 120, 170]];
-/// What marks lost steps.
+/// The mark for lost steps.
 pub const LOST: Rgb = [255, 64, 64];
 const PROBE: Rgb = [228, 232, 240];
 const PIN: Rgb = [200, 80, 210];

@@ -51,7 +51,7 @@ impl Font {
 /// Pixels, and how shapes come onto them.
 pub struct Canvas {
     pub pixmap: Pixmap,
-    /// What is left of the opacity of each shape, 0 to 1. Texts and rectangles keep theirs.
+    /// The remaining opacity of each shape, 0 to 1. Texts and rectangles keep theirs.
     pub opacity: f64,
 }
 

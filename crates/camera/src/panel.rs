@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a person reads beside the printer: displays, temperatures, fans, lights, the position, lost steps.
+//! The panel beside the printer: displays, temperatures, fans, lights, the position, lost steps.
 
 use crate::laid::{FASTEST_MM_PER_S, SPEEDS};
 use crate::machine::LOST;

@@ -94,7 +94,7 @@ struct Sheet {
     lens: Lens,
     /// The part of the room that the present lens shows; `None` for the whole printer.
     view: Option<Room>,
-    /// What stands still.
+    /// The parts that do not move.
     still: Canvas,
     laid: Canvas,
     canvas: Canvas,
@@ -118,7 +118,7 @@ impl Picture {
         for (turn, fan) in self.turns.iter_mut().zip(&scene.fans) {
             *turn = (*turn + fan.rpm / 60.0 / SLOW_MOTION * elapsed_s).fract();
         }
-        // What an earlier print has left is not worth drawing.
+        // Leftovers of an earlier print are not worth drawing.
         let first = scene.laid.iter().rposition(|piece| piece.begins).unwrap_or(0);
         let pieces = &scene.laid[first..];
         laid::draw(&mut self.plate, &self.plate_lens, pieces);

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a picture shows.
+//! The scene that a picture shows.
 
 /// Red, green and blue.
 pub type Rgb = [u8; 3];
 
-/// What never changes about a printer.
+/// The parts of a printer that never change.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Printer {
     /// The bed.
@@ -73,7 +73,7 @@ pub struct Scene {
     pub servos: Vec<Servo>,
     /// Probes beside the nozzle.
     pub probes: Vec<Probe>,
-    /// What was laid since the last scene.
+    /// The filament laid since the last scene.
     pub laid: Vec<Laid>,
 }
 

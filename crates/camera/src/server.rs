@@ -69,7 +69,7 @@ img { display: block; width: 100vw; height: 100vh; height: 100dvh; object-fit: c
 </html>
 ";
 
-/// Shows this printer to everybody who connects. `look` tells what there is to draw; it is called for each frame, and
+/// Shows this printer to everybody who connects. `look` returns the scene to draw; it is called for each frame, and
 /// only while somebody waits for one. All threads get the calling thread's priority.
 ///
 /// # Errors
@@ -142,7 +142,7 @@ impl Drop for Place {
     }
 }
 
-/// What a client asks for.
+/// A client's request.
 struct Request {
     method: String,
     /// The path, without what follows a question mark.

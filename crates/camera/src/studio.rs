@@ -86,7 +86,7 @@ impl Studio {
         state.reels[layout as usize].last.clone().filter(|newest| newest.number > after)
     }
 
-    /// Draws each frame that somebody waits for. `look` tells what there is to draw.
+    /// Draws each frame that somebody waits for. `look` returns the scene to draw.
     pub fn draw(&self, mut picture: Picture, mut look: impl FnMut() -> Scene) {
         for number in 1.. {
             let next = loop {

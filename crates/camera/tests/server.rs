@@ -93,7 +93,7 @@ fn get(target: &str) -> String {
 
 struct Viewer {
     stream: TcpStream,
-    /// What was read too much.
+    /// Bytes read beyond the end of the picture.
     bytes: Vec<u8>,
 }
 

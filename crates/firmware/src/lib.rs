@@ -33,7 +33,7 @@
 //!         Feature { commands: &[ECHO], responses: &[Echoed::FORM], ..Feature::EMPTY };
 //!
 //!     response! {
-//!         /// What was sent, and when it came.
+//!         /// Sent responses, with their times.
 //!         "echoed number=%u clock=%u"
 //!         pub struct Echoed { number: u32, clock: Clock }
 //!     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What went wrong, in one shape from the place where it happens to the place where it is printed.
+//! An error, in one shape from the place where it happens to the place where it is printed.
 
 #![forbid(unsafe_code)]
 
@@ -19,9 +19,9 @@ use std::fmt;
 pub struct Trouble {
     /// The object, device or file; `None` if the cause names it.
     pub subject: Option<Box<str>>,
-    /// What happened, and why.
+    /// The event and its cause.
     pub cause: Box<str>,
-    /// What to do about it.
+    /// The remedy.
     pub remedy: Option<Box<str>>,
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! CAN interfaces: what the kernel tells about them over netlink (rtnetlink(7), linux/can/netlink.h).
+//! CAN interfaces: their state as the kernel reports it over netlink (rtnetlink(7), linux/can/netlink.h).
 
 #![forbid(unsafe_code)]
 

@@ -230,7 +230,7 @@ mod tests {
         assert!((1..=every + 1).contains(&clock.tick_after(now).unwrap().since(now)));
     }
 
-    /// What a clock of this frequency shows, if readings take these times.
+    /// The measurement of a clock of this frequency, if readings take these times.
     fn shown(hz: u64, takes_ns: &[u64]) -> impl Iterator<Item = u64> {
         let takes_ns: Vec<u64> = (0..100).flat_map(|_| takes_ns.to_vec()).collect();
         let mut at_ns = 0;

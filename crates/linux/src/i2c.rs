@@ -85,7 +85,7 @@ fn failure(name: &str, (written, read): (usize, usize), error: &io::Error) -> Bu
     const CHECK_CHIP: &str = "check its wiring, its power and i2c_address";
     let (status, trouble) = match error.raw_os_error().unwrap_or_default() {
         libc::ENXIO => (BusStatus::StartNack, Trouble::new("no chip acknowledges the address").remedy(CHECK_CHIP)),
-        // Some drivers do not tell an address from a byte: i2c-bcm2835, i2c-designware.
+        // Some drivers report a refused address and a refused byte alike: i2c-bcm2835, i2c-designware.
         libc::EREMOTEIO => (BusStatus::Nack, Trouble::new("the chip does not acknowledge").remedy(CHECK_CHIP)),
         libc::ETIMEDOUT | libc::EBUSY => (
             BusStatus::Timeout,

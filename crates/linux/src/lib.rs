@@ -93,7 +93,7 @@ impl Inventory {
         inventory
     }
 
-    /// These chips, and everything else that the files below `root` tell. They tell nothing of ADCs.
+    /// These chips, and everything else from the files below `root`. ADCs are not among it.
     pub fn around(root: &Path, chips: Vec<gpio::Chip>) -> Inventory {
         let below = |path: &str| root.join(path.trim_start_matches('/'));
         let (dev, pwm, tty) = (below(DEV), below(PWM), below(TTY));

@@ -212,7 +212,7 @@ mod tests {
         }
     }
 
-    /// What the user of the service may do to root.
+    /// Attacks on root by the user of the service.
     #[test]
     fn neither_a_folder_nor_a_link_of_another_user_is_used_even_by_root() {
         if !pinion_testkit::here::is_root() {

@@ -97,7 +97,7 @@ pub enum Target {
 }
 
 impl Target {
-    /// What `pin` stands for.
+    /// The meaning of `pin`.
     pub fn of(pin: Pin) -> Target {
         let within = |base: u32, count: u32| pin.0.checked_sub(base).filter(|at| *at < count);
         if let Some(at) = within(ANALOG, ANALOG_CHANNELS) {

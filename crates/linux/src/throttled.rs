@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a Raspberry Pi's firmware tells about its power and its temperature
+//! The report of a Raspberry Pi's firmware on its power and its temperature
 //! (<https://www.raspberrypi.com/documentation/computers/os.html#get_throttled>).
 
 #![forbid(unsafe_code)]

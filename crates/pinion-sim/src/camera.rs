@@ -38,7 +38,7 @@ const JERK_S: f64 = 0.05;
 const POINTS: usize = 10_000;
 /// The color of a light that has only one.
 const WARM_WHITE: Rgb = [255, 240, 205];
-/// What is drawn of a printer without a bed.
+/// The picture's extent for a printer without a bed.
 const NO_BED: Space = Space { bed: BedShape::Rectangle { min_mm: [0.0; 2], max_mm: [200.0; 2] }, height_mm: 200.0 };
 
 /// An address as `--camera` takes it.
@@ -119,7 +119,7 @@ struct Filament {
     last: Option<PathPoint>,
     /// The speed there.
     mm_per_s: f64,
-    /// What is still to be drawn.
+    /// Pieces that are not drawn yet.
     laid: Arc<Mutex<Vec<Laid>>>,
 }
 

@@ -44,7 +44,7 @@ pub(crate) struct PathArgs {
     within: f64,
 }
 
-/// What becomes of the path.
+/// The exports of the path.
 #[derive(Clone, Copy)]
 enum Form {
     Drawing,

@@ -22,7 +22,7 @@ const PERIOD: Ticks = Ticks::from_us(1000);
 
 /// The measurements of one half: idle, or under load.
 pub struct Half {
-    /// What the computer did meanwhile.
+    /// The load on the computer during the measurement.
     pub name: &'static str,
     /// How late sleeps ended.
     pub wakeup: Lateness,
@@ -166,13 +166,13 @@ pub enum Fitness {
     Nothing,
 }
 
-/// What the measurements allow.
+/// The uses that the measurements allow.
 pub struct Verdict {
     /// The outputs.
     pub fitness: Fitness,
     /// The figure that decided.
     pub why: String,
-    /// What may make the computer better.
+    /// Settings that may improve the latency.
     pub remedy: Option<String>,
 }
 

@@ -38,7 +38,7 @@ pub mod status;
 mod transport;
 mod trouble;
 
-/// What the targets in `fuzz/` call.
+/// The functions for the targets in `fuzz/`.
 #[cfg(fuzzing)]
 pub mod fuzz {
     pub use super::guardian::fuzz::guardian;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What this crate says when the kernel refuses a thread, a process or memory.
+//! Errors of this crate when the kernel refuses a thread, a process or memory.
 
 #![forbid(unsafe_code)]
 
@@ -8,7 +8,7 @@ use std::io;
 
 use pinion_firmware::trouble::Trouble;
 
-/// What to do if there can be no further process or thread.
+/// The remedy if there can be no further process or thread.
 pub(crate) const NO_PROCESS: &str = "raise TasksMax or ulimit -u";
 
 /// That the kernel refuses something, in its words.

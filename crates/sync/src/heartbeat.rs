@@ -17,7 +17,7 @@ const SUBJECT: usize = 3;
 #[derive(Clone, Copy, Debug)]
 pub struct SharedHeartbeat<'a>(&'a [AtomicU32]);
 
-/// What a listener hears.
+/// The state that a monitor reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LastBeat {
     /// How long the next beat may take. `None`: a shutdown value is pending.
@@ -71,7 +71,7 @@ impl<'a> SharedHeartbeat<'a> {
         self.0[PENDING].store(0, Ordering::Release);
     }
 
-    /// What can be heard now.
+    /// The present state.
     pub fn listen(self) -> LastBeat {
         // The beat is read last.
         let silence_max_ms = match self.0[PENDING].load(Ordering::Acquire) {
@@ -81,7 +81,7 @@ impl<'a> SharedHeartbeat<'a> {
         LastBeat { silence_max_ms, beat_at: self.0[BEAT_AT].load(Ordering::Relaxed) }
     }
 
-    /// What it owes.
+    /// Its pending shutdown value.
     pub fn subject(self) -> Text<'a> {
         Text(&self.0[SUBJECT..])
     }

@@ -86,7 +86,7 @@ impl<'a> Ring<'a> {
         self.head[WRITTEN].load(Ordering::Acquire)
     }
 
-    /// What is at the place of a record. It may be half of another record.
+    /// The bytes at the place of a record. They may be half of another record.
     fn copy(self, number: u64) -> Record {
         self.place(number).each_ref().map(|word| word.load(Ordering::Relaxed))
     }

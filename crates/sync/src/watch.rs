@@ -15,7 +15,7 @@ pub struct Watch {
     announced: AtomicU32,
     /// The pulse that is watched.
     watched: AtomicU32,
-    /// What the second thread knows of the pulse before that one.
+    /// The second thread's findings about the pulse before that one.
     known: AtomicU32,
 }
 
@@ -47,7 +47,7 @@ impl Watch {
         self.announced.load(Ordering::Acquire)
     }
 
-    /// The second thread watches this pulse from now on, and tells what it knows of the one before. It ends a pulse if two
+    /// The second thread watches this pulse from now on, and reports on the one before. It ends a pulse if two
     /// of its looks after this call have found the line high.
     pub fn begin(&self, pulse: u32, known: u32) {
         self.known.store(known, Ordering::Relaxed);

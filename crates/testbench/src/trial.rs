@@ -538,7 +538,7 @@ impl Choices<'_> {
     }
 }
 
-/// What happened in trials.
+/// Counts of events in trials.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Commands that were sent to a running MCU.
@@ -743,7 +743,7 @@ impl<'a> Trial<'a> {
     }
 
     fn act(&mut self, action: &Action) {
-        // What fails is explained in words, which take memory, and so is a stop. `buttons_add` claims a pin.
+        // Failures and stops are explained in words, which take memory. `buttons_add` claims a pin.
         let is_sound =
             |rig: &Rig| rig.mcu.is_running() && !rig.mcu.has_pending_values() && rig.bench.state().broken.is_empty();
         let mut is_frugal = is_sound(&self.rig);

@@ -77,7 +77,7 @@ pub enum Event {
     HostGone,
     /// The link refused what came from the host.
     Refused(Refusal),
-    /// The link told the host that it had refused something, and from where on to send again.
+    /// The link refused a block, and asked the host to send again from a sequence number on.
     Nak,
     /// The link answered a block with this command by itself.
     Answered {

@@ -32,7 +32,7 @@ const THREADS_MAX: usize = 64;
 /// The wire of a host that `pinion attach` carries.
 pub const SSH: &str = "SSH";
 
-/// What ended a recording.
+/// The end of a recording.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum End {
@@ -47,7 +47,7 @@ pub enum End {
     Died,
     /// The core gave no sign of life. The guardian kept the recording, and killed the program.
     Hung {
-        /// What the guardian knows of it.
+        /// The guardian's account of it.
         diagnosis: String,
     },
     /// Somebody asked for the recording of a program that works.
@@ -78,7 +78,7 @@ pub struct Head {
     /// The wire to another computer, such as `can:can0` or [`SSH`], if there is one.
     #[serde(default)]
     pub wire: Option<String>,
-    /// What ended it.
+    /// Its end.
     pub end: End,
     /// When it ended, in ticks of the MCU's clock ([`Clock::to_bits`]).
     pub ended_at: u64,

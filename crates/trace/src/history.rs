@@ -15,7 +15,7 @@ use pinion_linux::foreign::plain;
 /// Ticks in a millisecond.
 pub(super) const TICKS_PER_MS: i64 = CLOCK_FREQ as i64 / 1000;
 
-/// What each thread did.
+/// The deeds of each thread.
 pub(super) struct History<'a> {
     head: &'a Head,
     /// The threads in the order of the trace. Each name comes once.
@@ -24,7 +24,7 @@ pub(super) struct History<'a> {
     pub last: i64,
 }
 
-/// What a thread did, in the order in which it ended.
+/// The deeds of a thread, in the order in which they ended.
 pub(super) struct Lane<'a> {
     /// Its name. It may contain anything.
     pub thread: &'a str,
@@ -52,7 +52,7 @@ pub(super) struct Deed {
     pub from: i64,
     /// Its end.
     pub to: i64,
-    /// The event at its end. The event at its beginning, if nothing tells of an end.
+    /// The event at its end. The event at its beginning, if no event is its end.
     pub event: Event,
     /// How long it waited before it began.
     pub waited: Ticks,
@@ -64,7 +64,7 @@ impl Deed {
         self.to.abs_diff(self.from)
     }
 
-    /// Whether nothing tells of its end. It seems to last until the end of the recording.
+    /// Whether no event is its end. It seems to last until the end of the recording.
     pub fn is_open(&self) -> bool {
         matches!(self.event, Event::Held | Event::JobBegan { .. })
     }
@@ -177,7 +177,7 @@ impl<'a> History<'a> {
         named(self.head.names.pins.get(&pin), "pin", pin.into())
     }
 
-    /// What ended the recording, in one line.
+    /// The cause of the recording's end, in one line.
     pub fn end(&self) -> String {
         match &self.head.end {
             End::Shutdown { reason, .. } => format!("the MCU stopped: {}", cut(reason, REASON_MAX)),
@@ -291,7 +291,7 @@ pub(super) fn at_ms(at: i64) -> String {
     format!("{:.2}", (ms * 100.0).round() / 100.0 + 0.0)
 }
 
-/// The deeds that these events of a thread tell of. `came`: when each block came. `end`: when the last event of all
+/// The deeds in these events of a thread. `came`: when each block came. `end`: when the last event of all
 /// threads happened.
 fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Deed> {
     let mut deeds = Vec::with_capacity(events.len());
@@ -429,7 +429,7 @@ pub(super) mod tests {
         trace
     }
 
-    /// What an export writes.
+    /// The text of an export.
     pub(crate) fn text(write: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> String {
         let mut text = Vec::new();
         write(&mut text).unwrap();
@@ -481,7 +481,7 @@ pub(super) mod tests {
         let core = [(100, woke), (110, Event::Block(1)), (200, Event::Held)];
         let lasting = [(120, Event::Held), (130, Event::Released)];
         let link = [(90, Event::BlockIn(1))];
-        // The first job began before the recording; nothing tells of the ends of the third and the fourth.
+        // The first job began before the recording; the third and the fourth have no event for their ends.
         let bus = [(10, ended), (20, began), (25, ended), (30, began), (60, began)];
         let trace = trace(End::Died, &[("core", &core), ("spi0", &bus), ("core", &lasting), ("link", &link)]);
         let history = History::of(&trace);

@@ -39,7 +39,7 @@ impl Writer {
 
     /// The same with a quota: the ring lasts ten seconds. It leaves out events that come faster, and counts them.
     pub fn lasting(ring: Ring<'static>, name: &str) -> Option<Writer> {
-        // Each window may have one more event, which tells how many were left out.
+        // Each window may have one more event, the number of omitted events.
         let each = (ring.capacity() / WINDOWS).saturating_sub(1).max(1);
         let quota = Quota { each: each as u32, until: Clock::from_bits(0), left: 0, omitted: 0 };
         let mut writer = Writer::new(ring, name)?;
@@ -96,7 +96,7 @@ mod tests {
         let events: Vec<(Clock, Event)> = ring.newest().into_iter().filter_map(Event::decode).collect();
         let (first, _) = events[0];
         assert!(at(2_999_999).since(first) > i64::from(Ticks::from_ms(10_000).0), "{first:?}");
-        // Each window begins with its events, and the next one tells how many are missing.
+        // Each window begins with its events, and the next one has the number of missing events.
         let omitted: u32 =
             events.iter().map(|(_, event)| if let Event::Omitted(count) = event { *count } else { 0 }).sum();
         let kept = events.iter().filter(|(_, event)| matches!(event, Event::Block(_))).count();

@@ -110,7 +110,7 @@ impl Window {
         (self.from..=self.to).contains(&at)
     }
 
-    /// The spans of these deeds in the picture. Those that cannot be told apart are one. So their number is bounded.
+    /// The spans of these deeds in the picture. Spans that cannot be distinguished are one. So their number is bounded.
     fn bars(&self, spans: impl Iterator<Item = (i64, i64)>) -> Vec<(f64, f64)> {
         let inside = spans.filter(|(from, to)| *to >= self.from && *from <= self.to);
         let mut bars: Vec<(f64, f64)> = inside.map(|(from, to)| (self.x(from), self.x(to))).collect();
@@ -131,7 +131,7 @@ struct Row {
     name: String,
     color: &'static str,
     bars: Vec<(f64, f64)>,
-    /// Only moments are told, which have no length.
+    /// Only moments have text; they have no length.
     moments: bool,
 }
 

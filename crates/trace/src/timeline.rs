@@ -64,7 +64,7 @@ pub fn write(trace: &Trace, last: Duration, out: &mut impl Write) -> io::Result<
     Ok(())
 }
 
-/// Where a deed stands in the timeline: those that a line tells with their end stand at their beginning.
+/// Where a deed stands in the timeline: those with their end in the same line stand at their beginning.
 fn place(deed: &Deed) -> i64 {
     if is_range(deed) { deed.from } else { deed.to }
 }

@@ -230,7 +230,7 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
     signals
 }
 
-/// The core is awake between its sleeps. Nothing tells of its next sleep, so the last time is that of its last event.
+/// The core is awake between its sleeps. Its next sleep is not recorded, so the last time is that of its last event.
 fn awake(core: &[Deed]) -> Signal {
     let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();
     let known = sleeps.first().map_or(i64::MAX, |deed| deed.from);
@@ -268,7 +268,7 @@ mod tests {
     use std::collections::HashMap;
     use std::process::Command;
 
-    /// What sigrok reads: the changes of each wire by its name, with their times in units of 100 ns.
+    /// The signals as sigrok reads them: the changes of each wire by its name, with their times in units of 100 ns.
     fn read_by_sigrok(vcd: &str) -> Option<HashMap<String, Vec<(u64, char)>>> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), vcd).unwrap();

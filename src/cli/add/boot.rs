@@ -11,8 +11,8 @@ use super::change::Splice;
 /// The values with which config.txt switches a parameter on. None is also one.
 const ON: [&str; 4] = ["on", "true", "yes", "1"];
 
-/// What to insert into a config.txt so that all of `wanted` are on for a board to which these sections apply. `None` if
-/// they are on already. `device` names the lines for a reader.
+/// The lines to insert into a config.txt so that all of `wanted` are on for a board to which these sections apply.
+/// `None` if they are on already. `device` names the lines for a reader.
 pub(super) fn config_txt(text: &str, sections: &[String], device: &str, wanted: &[&str]) -> Option<Splice> {
     let missing: Vec<&str> = wanted.iter().copied().filter(|wanted| !is_on(text, sections, wanted)).collect();
     if missing.is_empty() {
@@ -47,7 +47,7 @@ fn is_on(text: &str, sections: &[String], wanted: &str) -> bool {
     if let Some(overlay) = wanted.strip_prefix("dtoverlay=") {
         let own = lines.iter().filter_map(|line| line.strip_prefix("dtoverlay="));
         let name = |overlay: &str| overlay.split(',').next().unwrap_or_default().trim().to_owned();
-        // The same overlay may load several devices, and then its parameters tell them apart.
+        // The same overlay may load several devices, and then they differ by its parameters.
         return own.clone().any(|own| own == overlay)
             || !overlay.contains(',') && own.into_iter().any(|own| name(own) == overlay);
     }
@@ -65,7 +65,7 @@ fn parameter(name: &str) -> &str {
     }
 }
 
-/// What to change in an armbianEnv.txt or its like so that an overlay of this bus is loaded. `files` are the names of
+/// The change to an armbianEnv.txt or its like so that an overlay of this bus is loaded. `files` are the names of
 /// the image's overlays, without `.dtbo`. Nothing if one is loaded already.
 ///
 /// # Errors

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What can be added, and to which boards: the files in `devices` and `boards`, one for each.
+//! Devices that can be added, and boards: the files in `devices` and `boards`, one for each.
 //!
 //! To add one, write its file and name it in [`DEVICES`] or [`BOARDS`]. The tests check it.
 
@@ -71,14 +71,14 @@ pub(super) struct Device {
     #[serde(skip)]
     pub(super) name: &'static str,
     pub(super) title: String,
-    /// What most often goes wrong with it.
+    /// The most frequent fault.
     pub(super) trap: String,
     /// Its section of printer.cfg.
     pub(super) section: String,
     /// Whether it measures resonances, and so wants a `[resonance_tester]`.
     #[serde(default)]
     pub(super) resonance: bool,
-    /// What to type when it works.
+    /// The command to type when it works.
     pub(super) next: Vec<String>,
     /// The ways to connect it, the best one first.
     pub(super) way: Vec<Way>,
@@ -138,7 +138,7 @@ pub(super) struct Board {
     pub(super) name: String,
     /// How the device tree's model begins.
     models: Vec<String>,
-    /// A text in a file that tells it from a board with the same model.
+    /// A text in a file that a board with the same model does not have.
     marker: Option<Marker>,
     pub(super) boot: Boot,
     /// The files with the boot loader's settings. The first one that is there counts.
@@ -156,7 +156,7 @@ pub(super) struct Board {
     lines: BTreeMap<String, String>,
     /// The pins for lines that nothing else needs, the best one first.
     free: Vec<usize>,
-    /// What there is on the header.
+    /// The functions on the header.
     pub(super) bus: BTreeMap<Kind, Bus>,
 }
 
@@ -167,7 +167,7 @@ struct Marker {
     text: String,
 }
 
-/// How a board's boot loader is told what to enable.
+/// The way to enable something in a board's boot loader.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
 pub(super) enum Boot {
     /// A Raspberry Pi's config.txt.
@@ -399,7 +399,7 @@ mod tests {
         Catalog::read().unwrap();
     }
 
-    /// What a mistake in a file would be.
+    /// Mistakes in a file.
     #[test]
     fn the_data_fit_together() {
         let catalog = Catalog::read().unwrap();

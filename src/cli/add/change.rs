@@ -65,7 +65,7 @@ impl Splice {
 /// A change of one file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Change {
-    /// What it is for. Several devices may need the same.
+    /// Its purpose. Several devices may need the same.
     pub(super) key: String,
     /// The file, as a path of the computer.
     pub(super) file: PathBuf,
@@ -74,7 +74,7 @@ pub(super) struct Change {
     pub(super) splice: Splice,
 }
 
-/// What a device has changed, and what it needs of others' changes.
+/// A device's changes, and the changes of others that it needs.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Record {
     pub(super) changes: Vec<Change>,
@@ -188,7 +188,7 @@ impl Side<'_> {
         self.records.join(format!(".add-{device}.json"))
     }
 
-    /// What was recorded of a device.
+    /// The record of a device.
     ///
     /// # Errors
     ///

@@ -110,7 +110,7 @@ pub(super) fn run(args: &AddArgs) -> ExitCode {
     }
 }
 
-/// What `pinion doctor` says: the devices of these configurations whose bus is not there, and how to get it.
+/// The finding of `pinion doctor`: the devices of these configurations whose bus is not there, and how to get it.
 pub(super) fn missing(computer: &Computer, configs: &BTreeSet<PathBuf>) -> Vec<Finding> {
     let Ok(catalog) = Catalog::read() else { return Vec::new() };
     let printers = configs.iter().filter_map(|config| Printer::read(computer, config).ok());
@@ -219,7 +219,7 @@ fn list(catalog: &Catalog, board: Option<&Board>, model: &str, report: &mut Repo
     Ok(())
 }
 
-/// What is printed: lines for people as they come, or one JSON document at the end.
+/// The output: lines for people as they come, or one JSON document at the end.
 #[derive(Default)]
 struct Report {
     json: bool,
@@ -445,7 +445,7 @@ impl Work<'_> {
         self.report.show()
     }
 
-    /// What to change so that the bus is there, and whether it is.
+    /// The changes that give the board the bus, and whether it is there.
     fn plan_boot(&self) -> Result<(Record, State), String> {
         let mut record = Record::default();
         let Some(bus) = self.board.bus.get(&self.way.bus) else { return Ok((record, State::There)) };
@@ -711,7 +711,7 @@ impl Work<'_> {
         if is_known || !is_shared { Ok(()) } else { side.make(self.device.name, record) }
     }
 
-    /// Restarts the host, and asks it for a first value. What fails here is not undone: it is told.
+    /// Restarts the host, and asks it for a first value. A failure here undoes nothing: it is reported.
     fn measure(&mut self, is_changed: bool) {
         let moonraker = Moonraker(&self.args.moonraker);
         let measured = || -> Result<String, String> {

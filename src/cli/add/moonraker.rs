@@ -28,7 +28,7 @@ const LEAVE_TIMEOUT: Duration = Duration::from_secs(3);
 /// A Moonraker.
 pub(super) struct Moonraker<'a>(pub(super) &'a str);
 
-/// What the host does.
+/// The state of the host.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Host {
     /// A print runs or is paused.
@@ -40,7 +40,7 @@ pub(super) enum Host {
 }
 
 impl Moonraker<'_> {
-    /// What the host does now.
+    /// The present state of the host.
     pub(super) fn host(&self) -> Host {
         let answer = match self.ask("GET", "/printer/objects/query?print_stats&idle_timeout") {
             Ok(answer) => answer,

@@ -49,7 +49,7 @@ pub(super) struct Printer {
     pub(super) path: PathBuf,
     /// Its owner and group.
     pub(super) owner: (u32, u32),
-    /// What printer.cfg itself holds.
+    /// The contents of printer.cfg itself.
     text: String,
     sections: BTreeMap<String, Section>,
     /// The patterns of all includes in printer.cfg itself, as absolute paths.

@@ -18,7 +18,7 @@ const TEMPERATURES: std::ops::RangeInclusive<f64> = -40.0..=150.0;
 /// The bit of an SPI chip's register address that means reading.
 const SPI_READ: u8 = 0x80;
 
-/// What a device has answered.
+/// The answers of a device.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Answer {
     /// In words, for a reader.
@@ -27,7 +27,7 @@ pub(super) struct Answer {
     pub(super) address: Option<u8>,
 }
 
-/// What is known of the answers on a bus.
+/// The known answers on a bus.
 pub(super) trait Buses {
     /// Opens the SPI device.
     ///
@@ -214,7 +214,7 @@ fn judge(catalog: &Catalog, register: u8, ids: &[u8], answers: &[u8]) -> Result<
     }
 }
 
-/// What all zeros or all ones mean.
+/// The meaning of all zeros or all ones.
 fn silence(answer: &[u8]) -> Option<String> {
     let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
     if is_all(0) {

@@ -65,7 +65,7 @@ impl Computer {
         self.subsystem(about).is_none_or(|own| own == subsystem)
     }
 
-    /// The subsystem of a device. `None` if the kernel does not tell.
+    /// The subsystem of a device. `None` if it is unknown.
     pub(in crate::cli) fn subsystem(&self, device: &fs::Metadata) -> Option<String> {
         let (major, minor) = (major(device.rdev()), minor(device.rdev()));
         let subsystem = fs::read_link(self.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;

@@ -86,7 +86,7 @@ mod tests {
 
     const RASPBERRY_PI_OS: &str = "usr/lib/systemd/system.conf.d/40-rpi-enable-watchdog.conf";
 
-    /// What is found, and the remedy. Both are empty if systemd leaves the watchdog alone. `said` is the output of
+    /// The finding, and the remedy. Both are empty if systemd leaves the watchdog alone. `said` is the output of
     /// `systemctl show`.
     fn found(tree: &Tree, said: Option<&str>) -> (String, String) {
         let script = |said| format!("#!/bin/sh\n[ \"$*\" = 'show -p RuntimeWatchdogUSec' ] && echo {said}\n");

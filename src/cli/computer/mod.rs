@@ -83,7 +83,7 @@ impl Computer {
         Computer { root: root.to_owned(), caller }
     }
 
-    /// True for the live system (root is `/`). Its kernel can be asked more than its files tell.
+    /// True for the live system (root is `/`). Its kernel knows more than its files.
     pub(in crate::cli) fn is_this(&self) -> bool {
         self.root == Path::new("/")
     }

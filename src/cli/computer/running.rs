@@ -183,7 +183,7 @@ pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>)
 
 /// Why this computer must not be kept busy: a host may be printing through a Pinion on its pins. A simulated printer
 /// has nothing to spoil. A process of another user does not count: with one, any user could keep all others from
-/// measuring. [`print_of_another`] tells of it.
+/// measuring. [`print_of_another`] reports it.
 pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
     let proc = computer.path("/proc");
     computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {

@@ -276,7 +276,7 @@ fn model(computer: &Computer) -> String {
 /// The subsystem of a node in /dev that is another device than its name says, such as a null device.
 fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<String> {
     let about = fs::metadata(node).ok().filter(|about| about.file_type().is_char_device())?;
-    // If the kernel does not tell, the node counts as right.
+    // If it is unknown, the node counts as right.
     let subsystem = computer.subsystem(&about)?;
     (subsystem != class.subsystem).then_some(subsystem)
 }

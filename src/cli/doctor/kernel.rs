@@ -90,7 +90,7 @@ fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     let Some(isolated) = computer.text("/sys/devices/system/cpu/isolated") else {
         return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
     };
-    // If the kernel does not tell, any processor may be there.
+    // If it is unknown, any processor may be there.
     let present = computer.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
     let mut findings = Vec::new();
     let mut taken: Vec<usize> = Vec::new();

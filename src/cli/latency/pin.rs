@@ -52,7 +52,7 @@ pub(super) fn measure(name: &str, wish: FastGpio) -> Result<String, String> {
     Ok(text + &format!("on {}, Linux {}\n", model.trim_end_matches('\0'), kernel.trim()))
 }
 
-/// What the measurement of this line cannot show.
+/// The limits of the measurement of this line.
 fn hidden(line: &dyn Line) -> &'static str {
     match line.is_posted() {
         true => {

@@ -26,7 +26,7 @@ const ANSWER_MAX: usize = 4 << 20;
 
 /// A Pinion's answer.
 pub struct Answer {
-    /// What it says.
+    /// Its answer.
     pub status: Status,
     /// One line about the fields that this version does not know.
     pub(super) notice: Option<String>,
@@ -44,7 +44,7 @@ pub fn ask_at(paths: &[PathBuf], link: &Path) -> Result<Answer, String> {
     answer(&path, &document)
 }
 
-/// What the first of these sockets that answers says, and its path. They are of the instance with this link.
+/// The answer of the first of these sockets that answers, and its path. They are of the instance with this link.
 pub(in crate::cli) fn fetch(paths: &[PathBuf], link: &Path, bytes_max: usize) -> Result<(PathBuf, Vec<u8>), String> {
     let mut missing = Vec::new();
     for path in paths {

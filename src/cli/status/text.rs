@@ -38,7 +38,7 @@ pub(super) fn page(status: &Status) -> Page {
         row("timers", lateness(&mcu.lateness));
     }
     row("queues", queues(&mcu.queues));
-    // What is measured is read most, and pins are the most.
+    // Measurements are read most, and pins are the most.
     let (measured, others): (Vec<&Object>, Vec<&Object>) =
         mcu.objects.iter().partition(|object| matches!(object.value, Some(Present::Adc(_))));
     table(&mut page, "objects", measured.into_iter().chain(others).map(object).collect());

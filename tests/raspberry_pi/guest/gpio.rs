@@ -52,7 +52,7 @@ fn update(client: &mut Client, oid: u8, value: u8) {
     client.send("update_digital_out", &[("oid", oid.into()), ("value", value.into())]).unwrap();
 }
 
-/// What the board has, from the kernel's command line.
+/// The board's features, from the kernel's command line.
 fn expected(variable: &str) -> String {
     env::var(variable).unwrap_or_else(|_| panic!("{variable} is not on the kernel's command line"))
 }

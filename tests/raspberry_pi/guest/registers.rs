@@ -25,7 +25,7 @@ fn configure(pinion: &Pinion) {
     config.apply(&mut client).expect("a configuration");
 }
 
-/// What `pinion` with these words prints, and says on stderr.
+/// The output of `pinion` with these arguments, on stdout and stderr.
 fn printed(words: &[&str]) -> String {
     let output = Command::new("pinion").args(words).output().expect("pinion on the path");
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
@@ -109,7 +109,7 @@ fn the_cost_of_an_edge_is_not_measured_on_a_line_that_somebody_holds() {
     assert_eq!(outside.edges(OTHER), "");
 }
 
-/// What steps of three steppers cost the core.
+/// The core's cost of steps of three steppers.
 struct Cost {
     /// Instructions of the core for each edge.
     instructions: f64,
@@ -168,7 +168,7 @@ fn steps_through_registers_cost_less() {
     }
 }
 
-/// What the kernel itself writes and reads, by its tracepoint gpio_value: a "set" or a "get" for each call of any
+/// The kernel's own writes and reads, by its tracepoint gpio_value: a "set" or a "get" for each call of any
 /// program.
 struct Calls;
 

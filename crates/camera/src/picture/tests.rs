@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a picture shows, by its pixels.
+//! The contents of a picture, by its pixels.
 
 use super::*;
 use crate::laid::speed_color;

@@ -37,7 +37,7 @@ struct Move {
     on_ticks: Ticks,
 }
 
-/// What the output's timer does when it runs next.
+/// The next event of the output's timer.
 enum Phase {
     /// Applies the next change of the queue.
     Load,

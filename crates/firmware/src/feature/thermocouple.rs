@@ -32,7 +32,7 @@ shutdowns! {
 }
 
 response! {
-    /// What the chip read `rest_ticks` before `next_clock`, and its fault bits.
+    /// The value that the chip read `rest_ticks` before `next_clock`, and its fault bits.
     "thermocouple_result oid=%c next_clock=%u value=%u fault=%c"
     pub(super) struct Reading { oid: Oid, next_clock: Clock, value: u32, fault: u8 }
 }

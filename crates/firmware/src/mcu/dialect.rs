@@ -20,7 +20,7 @@ use super::{DialectName, Dialects, Wire, base, since};
 /// The remedy for a host with another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
 
-/// What the MCU knows about a command, found by the command's id.
+/// A command of the dialect, found by its id.
 pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
@@ -106,7 +106,7 @@ impl<T> Choice<T> {
 
 /// The features of an MCU, and what its dictionary says about the program.
 pub struct Firmware {
-    /// What the MCU can do. The MCU's own feature comes first.
+    /// The features. The MCU's own feature comes first.
     pub features: &'static [Feature],
     /// The program's name.
     pub app: &'static str,

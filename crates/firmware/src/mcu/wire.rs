@@ -35,7 +35,7 @@ pub const CANBUS_UUID_BYTES: usize = 6;
 /// The MCU as a node of a CAN bus. The link keeps it, and the host asks for it.
 #[derive(Debug)]
 pub struct CanNode {
-    /// What klippy finds the MCU by: its `canbus_uuid`.
+    /// The `canbus_uuid`, by which klippy finds the MCU.
     pub uuid: [u8; CANBUS_UUID_BYTES],
     /// Bits per second, or 0.
     frequency: AtomicU32,

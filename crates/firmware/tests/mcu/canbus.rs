@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the dictionary and the MCU tell a host about the wire.
+//! Constants and responses about the wire.
 
 use std::sync::Arc;
 

@@ -102,7 +102,7 @@ fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
     assert_eq!(pulses(14_000_000), None);
 }
 
-/// What a host leaves behind whose wire is cut at tick 0: a heater and a fan that are on, a motor that moves, and a motor
+/// The state after a host whose wire is cut at tick 0: a heater and a fan that are on, a motor that moves, and a motor
 /// that homes with an endstop of another MCU.
 #[test]
 fn without_its_host_an_mcu_ends_what_was_begun() {

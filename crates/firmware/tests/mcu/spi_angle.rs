@@ -166,7 +166,7 @@ fn a_transfer_of_the_host_s_has_the_clock_of_its_latch() {
         let answer = rig.ask("spi_angle_transfer oid=1 data=8442");
         assert_eq!(answer, format!("spi_angle_transfer_response oid=1 clock=@{clock} response=5a5a"));
     }
-    // This transfer is too slow to tell a time.
+    // This transfer is too slow to give a time.
     let mut slow = rig(MT6816, 0, 2501);
     let answer = slow.ask("spi_angle_transfer oid=1 data=8442");
     assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@0 response=");

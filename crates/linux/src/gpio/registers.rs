@@ -692,7 +692,7 @@ mod tests {
         ) {
             let model = Model::new(layout);
             (0..LINES).for_each(|line| model.kernel_turns(line, None));
-            // Whether it is an output, the level that it was told, and the level outside.
+            // Whether it is an output, its set level, and the level outside.
             let mut lines = [(false, false, false); LINES as usize];
             for op in ops {
                 match op {

@@ -117,7 +117,7 @@ fn open(link: &Path) -> Result<Flock<File>, Trouble> {
         let mut raw = tcgetattr(&*file)?;
         cfmakeraw(&mut raw);
         tcsetattr(&*file, SetArg::TCSANOW, &raw)?;
-        // What is left of an earlier host.
+        // Leftovers of an earlier host.
         tcflush(&*file, FlushArg::TCIFLUSH)
     };
     make_raw().map_err(|error| refused(link.display(), error).remedy(START))?;

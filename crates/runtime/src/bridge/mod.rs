@@ -110,7 +110,7 @@ impl Wire {
         Ok(Wire { input, output, outward: Flow::new(), heard_at: now, said_at: now })
     }
 
-    /// What to wait for at the output.
+    /// The event to wait for at the output.
     fn output_events(&self) -> PollFlags {
         if self.outward.is_empty() { PollFlags::empty() } else { PollFlags::POLLOUT }
     }
@@ -164,7 +164,7 @@ fn read_some(fd: impl AsFd, buffer: &mut [u8]) -> io::Result<Heard> {
     }
 }
 
-/// Bytes for a reader that is gone count as written. The next read tells that it is gone.
+/// Bytes for a reader that is gone count as written. The next read reports that it is gone.
 fn write_some(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     match write(fd, bytes) {
         Ok(written) => Ok(written),

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The near end: a pty for the host, and ssh to the far end.
 //!
-//! There is always a connection, or an attempt, also without a host. So the log tells early what is wrong, and a host
+//! There is always a connection, or an attempt, also without a host. So the log reports an error early, and a host
 //! does not wait for ssh. The host's first bytes stay in the pty until the far end has its terminal open.
 
 #![forbid(unsafe_code)]
@@ -35,7 +35,7 @@ const PAUSE_MIN: Duration = Duration::from_secs(1);
 const PAUSE_MAX: Duration = Duration::from_secs(8);
 /// How long an attempt may take.
 const CONNECT_MAX: Duration = Duration::from_secs(30);
-/// How often the log tells the round trips.
+/// How often the round trips are logged.
 const REPORT_EVERY: Duration = Duration::from_secs(60);
 
 /// Carries hosts that open `link` to `target`, until SIGTERM, SIGINT or SIGHUP.
@@ -98,7 +98,7 @@ struct Near {
     is_attached: bool,
     state: State,
     pause: Duration,
-    /// What the log said last about a lost connection. Each attempt may fail in the same way.
+    /// The last log line about a lost connection. Each attempt may fail in the same way.
     told: String,
     to_host: Flow,
     trips: RoundTrips,
@@ -161,7 +161,7 @@ impl Near {
                 }
             }
         }
-        // A host that is there is heard once the connection is up. That it goes is always told.
+        // A host that is there is heard once the connection is up. Its end is always reported.
         let listens = takes_from_host || !self.is_attached;
         let events = flag(listens, PollFlags::POLLIN) | flag(!self.to_host.is_empty(), PollFlags::POLLOUT);
         let is_up = matches!(self.state, State::Up { .. });
@@ -240,7 +240,7 @@ impl Near {
                     .map_err(about)?;
                 bytes = read.len();
                 self.trips.sent(read, monotonic());
-                // It may be gone. Then its end tells.
+                // It may be gone. Then its end is reported.
                 let _ = wire.write();
             }
             // Somebody wrote and has left.
@@ -251,7 +251,7 @@ impl Near {
             }
             None => {}
         }
-        // What the host wrote before it went comes first.
+        // Bytes that the host wrote before it went come first.
         if hung_up && bytes == 0 && self.is_attached {
             self.part();
         }

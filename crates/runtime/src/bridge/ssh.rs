@@ -124,12 +124,12 @@ impl Target {
 /// A running ssh. Dropping it ends it.
 pub(super) struct Ssh {
     child: Child,
-    /// `None` when it is told to end.
+    /// `None` when it shall end.
     wire: Option<Wire>,
     messages: Messages,
 }
 
-/// What ssh and the other end say in words.
+/// Messages of ssh and of the other end.
 struct Messages {
     fd: Option<OwnedFd>,
     text: Vec<u8>,

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The messages between program and guardian. Their socket (SOCK_SEQPACKET) keeps each in one piece.
 //!
-//! The first byte of a message tells which [`Message`] it is. A message about a line or a file comes with its
+//! The first byte of a message is the kind of [`Message`]. A message about a line or a file comes with its
 //! descriptor. The guardian answers each with [`TAKEN`] or [`REFUSED`], except for [`Message::Goodbye`].
 
 #![forbid(unsafe_code)]

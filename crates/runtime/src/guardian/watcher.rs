@@ -392,7 +392,7 @@ fn summary(outcomes: &[&Outcome]) -> String {
     }
 }
 
-/// What a thread reports after each attempt to drive an output: the output's number, and the result.
+/// A thread's report after each attempt to drive an output: the output's number, and the result.
 type Attempt = (usize, io::Result<()>);
 
 /// Threads that each drive a group of outputs. So a driver that hangs delays neither the other groups nor this process.

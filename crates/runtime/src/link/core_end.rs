@@ -76,7 +76,7 @@ impl CoreEnd {
         self.ledger.hand();
     }
 
-    /// What the core has been handed so far.
+    /// The blocks that the core has got so far.
     pub(crate) fn handed(&self) -> Handed {
         Handed { blocks: self.ledger.handed(), stops: self.progress.stops_handed() }
     }

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds out what to tell a new host: its dialect, and what the board has now. The host's first bytes wait for that.
+//! Finds the dictionary for a new host: its dialect, and the board's present devices. The host's first bytes wait for
+//! that.
 
 #![forbid(unsafe_code)]
 

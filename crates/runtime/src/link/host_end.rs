@@ -94,12 +94,12 @@ impl HostEnd {
         self.link.event()
     }
 
-    /// When to call [`HostEnd::read`] although the descriptor tells nothing (CLOCK_MONOTONIC).
+    /// When to call [`HostEnd::read`] although the descriptor reports nothing (CLOCK_MONOTONIC).
     pub(crate) fn due(&self) -> Option<Duration> {
         self.link.due().into_iter().chain(self.silent_until).min()
     }
 
-    /// Whether the link's descriptor would tell of room for bytes.
+    /// Whether the link's descriptor would report room for bytes.
     pub(crate) fn tells_of_room(&self) -> bool {
         self.link.due().is_none()
     }
@@ -173,7 +173,7 @@ impl HostEnd {
         Ok(read)
     }
 
-    /// What another program on the same wire has done, if it must stop the MCU.
+    /// The fault of another program on the same wire, if it must stop the MCU.
     pub(crate) fn intrusion(&mut self) -> Option<Shutdown> {
         self.link.intrusion()
     }

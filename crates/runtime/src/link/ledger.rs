@@ -29,7 +29,7 @@ pub(crate) struct Ledger {
     said: u32,
     /// The number of the last empty block that was sent.
     acknowledged: u32,
-    /// The host has yet to be told that a block was refused.
+    /// The host does not know yet that a block was refused.
     nak_owed: bool,
 }
 
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// What link and core can do, in any order.
+    /// The steps of link and core, in any order.
     #[derive(Clone, Copy, Debug)]
     enum Event {
         /// A block for the core comes.

@@ -40,7 +40,7 @@ impl Oversight {
         let events = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
         events.add(signals.event(), EpollEvent::new(EpollFlags::EPOLLIN, 0))?;
         if let Some(guardian) = &guardian {
-            // The kernel tells of a hang-up in any case.
+            // The kernel reports a hang-up in any case.
             events.add(guardian.socket(), EpollEvent::new(EpollFlags::empty(), 0))?;
         }
         Ok(Oversight { events, signals, guardian, vigil, leave_at: None })

@@ -98,7 +98,7 @@ pub(crate) struct LinkThread {
     trace_writer: Option<ring::Writer>,
 }
 
-/// What ended the link's sleep. The link looks only there, because each look is a system call.
+/// The event that ended the link's sleep. The link reads only its descriptor: each read is a system call.
 #[derive(Clone, Copy, Debug)]
 struct Woken {
     by_oversight: bool,
@@ -313,7 +313,7 @@ impl LinkThread {
 
     /// Speaks this dialect from now on.
     fn speak(&mut self, dialect: Arc<Dialect>) {
-        // The search for the host has told that, too.
+        // The search for the host has logged that, too.
         self.recorder.carry(self.host.is_carried());
         if Arc::ptr_eq(&dialect, &self.known.dialect) {
             return;
@@ -464,7 +464,7 @@ mod tests {
         assert_eq!((reader.int(), reader.bytes()), (Ok(40), Ok(&dialect.compressed()[40..60])));
         assert!(reader.is_empty());
 
-        // What needs the core, or the order of a block.
+        // Commands that need the core, or the order of a block.
         let others: [&[(&str, &[u32])]; 8] = [
             &[],
             &[("get_config", &[])],

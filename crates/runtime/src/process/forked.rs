@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the program's forked processes have in common.
+//! The common start of the program's forked processes.
 
 #![forbid(unsafe_code)]
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What Pinion is to the kernel and to the service manager: real time, signals, the processes that it forks, watchdogs.
+//! Pinion as a process of the kernel and of the service manager: real time, signals, the processes that it forks,
+//! watchdogs.
 
 #![forbid(unsafe_code)]
 

@@ -61,7 +61,7 @@ impl Notify {
     }
 }
 
-/// How often to tell the service manager that the program is alive: at half of its limit (`WatchdogSec=`). `None` if it
+/// How often the service manager gets a sign of life: at half of its limit (`WatchdogSec=`). `None` if it
 /// sets no limit.
 pub(crate) fn watchdog_interval() -> Option<Duration> {
     let variable = |name| env::var(name).ok();

@@ -26,7 +26,7 @@ use pinion_linux::proc::status_field;
 
 use crate::core::budget::Class;
 
-/// What a thread does.
+/// The purpose of a thread.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Owns the MCU.

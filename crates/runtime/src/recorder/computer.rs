@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the kernel tells about this computer: how long threads waited for a processor, and what slows the computer
-//! down. Not every computer tells everything.
+//! The kernel's accounts of this computer: how long threads waited for a processor, and what slows the computer
+//! down. Not every computer has all of them.
 
 #![forbid(unsafe_code)]
 

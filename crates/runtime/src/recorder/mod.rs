@@ -133,7 +133,7 @@ impl Recording {
         self.memory.guardian()
     }
 
-    /// What the recording says now.
+    /// The present text of the recording.
     fn trace(&self, end: End, ended_at: Clock) -> Trace {
         let thread = |ring: Ring<'_>| Thread {
             name: ring.name(),
@@ -376,7 +376,7 @@ impl Keeper {
                     }
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
-                        // The accounts at the stop tell more than those before it.
+                        // The accounts at the stop show more than those before it.
                         next = monotonic() + computer.look(self.recording.clock.now(), true);
                         let end = End::Shutdown { reason: reason.to_owned(), trouble };
                         self.recording.keep_stop(&self.recording.trace(end, at), &mut self.paces);

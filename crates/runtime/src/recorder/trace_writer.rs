@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the core records. It costs a few stores for each turn of the core. It neither allocates nor calls the kernel,
+//! The core's trace writer. It costs a few stores for each turn of the core. It neither allocates nor calls the kernel,
 //! except when the MCU is configured or stops.
 
 #![forbid(unsafe_code)]
@@ -41,7 +41,7 @@ pub(super) enum News {
     },
 }
 
-/// What the core records.
+/// The recording of the core.
 pub(crate) struct TraceWriter {
     recent: Writer,
     lasting: Writer,

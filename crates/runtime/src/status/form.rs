@@ -146,7 +146,7 @@ pub struct Stop {
 pub struct Line {
     /// Name of the pin.
     pub pin: String,
-    /// What it is used for.
+    /// Its purpose.
     #[serde(rename = "use")]
     pub use_: Use,
     /// 0 or 1, as last driven or sampled; `None` before the first sample.

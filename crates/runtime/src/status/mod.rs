@@ -31,7 +31,7 @@ const ANSWER_WAIT_MAX: Duration = Duration::from_millis(1000);
 /// Time between two looks for the answer.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// What the core sends with the MCU's snapshot.
+/// The core's own figures, sent with the MCU's snapshot.
 #[derive(Default)]
 struct Answer {
     mcu: Snapshot,

@@ -354,7 +354,7 @@ mod tests {
         listener.set_nonblocking(true).unwrap();
         let manners = ClientLimits { pause: Duration::from_millis(1), limit };
         let thread = serve_on(listener, "test", manners, move || Some(vec![7; bytes])).unwrap();
-        // A client that is in the kernel's queue is not being served yet: its first byte tells.
+        // A client that is in the kernel's queue is not being served yet; its first byte shows that it is.
         let client = move || {
             let client = UnixStream::connect(&path).unwrap();
             let mut fds = [PollFd::new(client.as_fd(), PollFlags::POLLIN)];

@@ -49,7 +49,7 @@ pub(crate) trait Link {
         None
     }
 
-    /// The wire, as the dictionary tells it to the host.
+    /// The wire, as the dictionary has it.
     fn wire(&self) -> Wire {
         Wire::Terminal
     }
@@ -58,7 +58,7 @@ pub(crate) trait Link {
     /// link is closed.
     fn event(&self) -> Option<BorrowedFd<'_>>;
 
-    /// When to read or write although the descriptor tells nothing (CLOCK_MONOTONIC).
+    /// When to read or write although the descriptor reports nothing (CLOCK_MONOTONIC).
     fn due(&self) -> Option<Duration> {
         None
     }
@@ -78,8 +78,8 @@ pub(crate) trait Link {
         true
     }
 
-    /// How long a host that is there may be silent. klippy asks for the time each second. `None`: the kernel tells when
-    /// a host goes.
+    /// How long a host that is there may be silent. klippy asks for the time each second. `None`: the kernel reports
+    /// when a host goes.
     fn silence_max(&self) -> Option<Duration> {
         Some(Duration::from_secs(5))
     }
@@ -87,13 +87,13 @@ pub(crate) trait Link {
     /// The host is gone. Bytes that it has not read are dropped.
     fn part_from_host(&mut self) {}
 
-    /// What another program on the same wire has done, if it must stop the MCU.
+    /// The fault of another program on the same wire, if it must stop the MCU.
     fn intrusion(&mut self) -> Option<pinion_firmware::shutdown::Shutdown> {
         None
     }
 }
 
-/// What the program does at the link's place. `is_open`: the link is not waiting for its port or interface.
+/// The program's use of the link's place. `is_open`: the link is not waiting for its port or interface.
 pub(crate) fn serving(is_open: bool) -> &'static str {
     if is_open { "serving on" } else { "waiting for" }
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What stands at a link's place: one judgment for the program that puts the link there, for `pinion run --check` and
+//! The file at a link's place: one judgment for the program that puts the link there, for `pinion run --check` and
 //! for `pinion doctor`.
 
 #![forbid(unsafe_code)]
@@ -9,7 +9,7 @@ use std::path::Path;
 
 use pinion_firmware::trouble::Trouble;
 
-/// What stands at a link's place.
+/// The file at a link's place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     /// Nothing, or nothing that can be seen.
@@ -23,7 +23,7 @@ pub enum Place {
 }
 
 impl Place {
-    /// What stands at `path`.
+    /// The file at `path`.
     pub fn of(path: &Path) -> Place {
         match fs::symlink_metadata(path) {
             Ok(found) if found.file_type().is_symlink() => Place::Link,

@@ -34,7 +34,7 @@ use pinion_linux::own_folder::OwnFolder;
 const TMP: &str = "/tmp";
 /// The stop command of Klipper's own service writes this to the link's path, even if no program serves there.
 const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
-/// How often the terminal is restored while no host is there. No event tells that a client has changed it.
+/// How often the terminal is restored while no host is there. There is no event when a client has changed it.
 const RESTORE_EVERY: Duration = Duration::from_secs(1);
 /// How long to wait for another program that serves a link in the same folder. Everybody may lock that folder.
 const TURN_MAX: Duration = Duration::from_secs(3);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A serial port: a UART, or the port of a USB gadget (`ttyGS0`). Nothing tells whether a host is at the other end, so
+//! A serial port: a UART, or the port of a USB gadget (`ttyGS0`). It is unknown whether a host is at the other end, so
 //! it is there as long as it sends.
 
 #![forbid(unsafe_code)]
@@ -118,7 +118,7 @@ impl Link for SerialLine {
         match write(file.as_fd(), bytes) {
             Ok(len) => Ok(len),
             Err(Errno::EAGAIN | Errno::EINTR) => Ok(0),
-            // A read tells that the port is gone.
+            // A read reports that the port is gone.
             Err(Errno::EIO | Errno::ENODEV | Errno::ENXIO) => Ok(bytes.len()),
             Err(error) => Err(error.into()),
         }

@@ -91,8 +91,8 @@ fn follow(link: &Path) -> Vec<PathBuf> {
     way
 }
 
-/// Whether the program was told to serve the terminal at another link. Then an earlier program, whose terminal had the
-/// same number, left this link behind.
+/// Whether the program has an order to serve the terminal at another link. Then an earlier program, whose terminal had
+/// the same number, left this link behind.
 fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
     let Some(link) = server.arguments.iter().skip_while(|argument| *argument != Path::new("-I")).nth(1) else {
         return false;

@@ -198,7 +198,7 @@ impl Link for Stdio {
                 self.full_until = Some(monotonic() + FULL_PAUSE);
                 Ok(0)
             }
-            // The input tells that the host is gone.
+            // The input reports that the host is gone.
             Err(Errno::EPIPE | Errno::EIO | Errno::ECONNRESET) => Ok(bytes.len()),
             Err(error) => Err(error.into()),
         }

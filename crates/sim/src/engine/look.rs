@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a person sees of a part: as data for a picture, and as text.
+//! The appearance of a part: as data for a picture, and as text.
 
 #![forbid(unsafe_code)]
 
@@ -30,7 +30,7 @@ impl fmt::Display for Colour {
     }
 }
 
-/// What a person sees of a part at one instant. Its text is what `pinion sim --show` prints.
+/// The appearance of a part at one instant. Its text is what `pinion sim --show` prints.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Look {
     /// A light, or a strip from its first light on.

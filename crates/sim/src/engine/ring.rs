@@ -168,7 +168,7 @@ impl RingWatch {
         (self.greatest_mm, self.sum_mm, self.looks) = (0.0, 0.0, 0);
     }
 
-    /// What was seen so far; `None` if the axis has not moved.
+    /// The ringing so far; `None` if the axis has not moved.
     pub fn seen(&self) -> Option<Ringing> {
         let mean_mm = self.sum_mm / self.looks as f64;
         (self.greatest_mm > 0.0).then_some(Ringing { greatest_mm: self.greatest_mm, mean_mm })

@@ -15,7 +15,7 @@ use pinion_firmware::board::{ADC_MAX, Adc, Bias, Direction, Edge, Edges, Line, P
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
-/// What the MCU may do with a pin.
+/// The uses of a pin that are allowed to the MCU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// Drive it.

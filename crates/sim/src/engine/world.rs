@@ -17,7 +17,7 @@ pub(crate) trait Sight: Send + Sync {
     /// The name of the part.
     fn name(&self) -> &str;
 
-    /// What a person sees at this instant.
+    /// The appearance at this instant.
     fn look(&self, now: Clock) -> Look;
 }
 
@@ -35,7 +35,7 @@ pub(crate) struct World {
     pub(crate) heaters: Vec<Arc<Heater>>,
     pub(crate) fans: Vec<Arc<Fan>>,
     pub(crate) lamps: Vec<Arc<Lamp>>,
-    /// What rings on an axis.
+    /// The oscillators on an axis.
     pub(crate) rings: Vec<(Arc<Rail>, RingConfig)>,
     pub(crate) sights: Vec<Arc<dyn Sight>>,
     /// By their serial numbers.

@@ -114,7 +114,7 @@ struct Reader {
     line: u32,
     /// x, y, z and e of the machine; `None` until the file says where it is.
     at: [Option<f64>; 4],
-    /// What G92 has put between the machine's places and the file's.
+    /// The offset that G92 has put between the machine's coordinates and the file's.
     base: [f64; 4],
     relative: bool,
     relative_filament: bool,

@@ -160,7 +160,7 @@ impl States {
     }
 }
 
-/// What is remembered for each line of the motors: the first state, and the place of the first bit. A bit says that the
+/// The record for each line of the motors: the first state, and the place of the first bit. A bit says that the
 /// state was entered on this line.
 struct Ways {
     rows: Vec<(usize, usize)>,

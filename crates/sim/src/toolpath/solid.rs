@@ -147,7 +147,7 @@ impl Bar {
     }
 }
 
-/// What a body has left out.
+/// The pieces that a body leaves out.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Body {
     /// How far its bars are off the path at most.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a trace tells about a span of time: who ran, who waited, who was silent.
+//! The evidence of a trace about a span of time: who ran, who waited, who was silent.
 //!
 //! Times are ticks after the stop, so that those before it are negative. Spans are ticks.
 
@@ -320,7 +320,7 @@ impl<'a> Record<'a> {
 
     /// How much more processor time than usual a hypervisor took in the samples that cover a span.
     pub(super) fn stolen(&self, span: Span) -> i64 {
-        // What was taken, and of how long a time, in these samples and in the others.
+        // The time taken, and the time observed, in these samples and in the others.
         let (mut here, mut elsewhere) = ((0, 0), (0, 0));
         let (mut before, mut stolen) = (None, 0);
         for (at, event) in self.thread(Thread::Sampler) {
@@ -374,7 +374,7 @@ impl<'a> Record<'a> {
             && self.within(Thread::Sampler, (start + 1, span.1 - 1)).next().is_none()
     }
 
-    /// Whether the guardian went on in a span. `None` if the span is too short to tell, or nothing of the guardian is
+    /// Whether the guardian went on in a span. `None` if the span is too short to decide, or nothing of the guardian is
     /// recorded.
     pub(super) fn guardian_went_on(&self, span: Span) -> Option<bool> {
         self.thread(Thread::Guardian).next()?;
@@ -404,7 +404,7 @@ impl<'a> Record<'a> {
         self.within(Thread::Core, span).count()
     }
 
-    /// The latest timer: when it ran, and how late. `None` if nothing of timers is recorded. `Late` alone tells its own
+    /// The latest timer: when it ran, and how late. `None` if nothing of timers is recorded. `Late` alone has its own
     /// time. `Pace` is about the time since the one before.
     pub(super) fn latest_timer(&self) -> Option<Span> {
         let timers = self.within(Thread::Core, (-RECENT, QUIET)).filter_map(|(at, event)| match event {
@@ -470,7 +470,7 @@ fn busy(trace: &Trace, since: impl Fn(Clock) -> i64) -> Vec<Span> {
         let mut before: Option<i64> = None;
         for (at, event) in &thread.events {
             let at = since(*at);
-            // What was left out came within the window of the event before.
+            // Omitted events came within the window of the event before.
             let until =
                 before.filter(|_| matches!(event, Event::Omitted(_))).map(|from| (from + i64::from(WINDOW.0)).min(at));
             busy.extend(until.and_then(|until| Some((before?, until.max(before?)))));

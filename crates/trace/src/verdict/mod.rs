@@ -31,7 +31,7 @@ mod standstill;
 const PROMPT: i64 = MS;
 /// How late a timer may be while nobody complains.
 const LATE: i64 = MS;
-/// How late a timer has to be to be told of with a stop for another reason.
+/// How late a timer has to be so that a stop for another reason mentions it.
 const VERY_LATE: i64 = 10 * MS;
 /// Shortest silence of a core that hangs. An idle core beats more often.
 const SILENT: i64 = 500 * MS;

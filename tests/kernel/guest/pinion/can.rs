@@ -148,7 +148,7 @@ impl Drop for Host {
     }
 }
 
-/// What happens to frames in one direction.
+/// The treatment of frames in one direction.
 struct Faults {
     is_on: bool,
     count: u32,
@@ -314,7 +314,7 @@ struct Flood {
 }
 
 impl Flood {
-    /// `round` sends some frames. It is told how many rounds there were.
+    /// `round` sends some frames. Its argument is the number of rounds so far.
     fn start(round: fn(&CanFdSocket, u32)) -> Flood {
         let bus = CanFdSocket::open(INTERFACE).expect("an interface");
         let is_over = Arc::new(AtomicBool::new(false));

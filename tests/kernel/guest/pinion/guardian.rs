@@ -144,7 +144,7 @@ impl Heater {
         assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
         sysfs::wait_until("the heater is off", || !self.is_on());
         program.wait_for_line(&["Pinion stood still for"]);
-        // The verdict cannot tell a control group from a virtual machine.
+        // The verdict cannot distinguish a control group from a virtual machine.
         let verdict = program.wait_for_line(&["Pinion and its guardian stood still for ", "a frozen control group"]);
         assert!(exists(program.guardian()));
         // Longer than both processes wait for each other.

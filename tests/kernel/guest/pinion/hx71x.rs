@@ -7,7 +7,7 @@ use crate::program::{Program, configure, refusal, run};
 use crate::sysfs;
 
 const MOCK: &str = "/sys/devices/platform/mock-spi";
-/// What MISO has for -5000 (ffec78), each bit twice, and for the pulse behind it.
+/// The bits on MISO for -5000 (ffec78), each bit twice, and for the pulse behind it.
 const SAMPLE: &str = "fffffcf03fc0ff";
 
 #[test]

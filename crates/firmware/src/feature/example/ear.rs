@@ -16,7 +16,7 @@ pub(super) const FEATURE: Feature =
     Feature { commands: &[CONFIG_EAR, QUERY_EAR], responses: &[Heard::FORM], ..Feature::EMPTY };
 
 response! {
-    /// What the ear heard.
+    /// The last sound.
     "ear_heard oid=%c loudness=%c"
     pub(super) struct Heard { oid: Oid, loudness: u8 }
 }

@@ -281,7 +281,8 @@ mod tests {
         (wire, pulses)
     }
 
-    /// What a chain understands, by the limits that the firmware's src/neopixel.c names: the bits between two resets.
+    /// The bits that a chain understands, by the limits that the firmware's src/neopixel.c names: the bits between two
+    /// resets.
     /// `None`: a pulse or a pause that has no certain meaning.
     fn understood(edges: &[(u64, bool)]) -> Vec<Option<Vec<bool>>> {
         let mut frames = vec![];

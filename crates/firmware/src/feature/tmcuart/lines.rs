@@ -71,7 +71,7 @@ pub(super) struct Lines {
     pub(super) spoilt: bool,
 }
 
-/// What was sent of a message.
+/// The sent part of a message.
 enum Sent {
     /// All bits. The last one ended at `end`. A bit was this long.
     All { end: Clock, bit: Ticks },

@@ -30,7 +30,7 @@ const REPLY_HEAD: [u8; 2] = [0x05, 0xff];
 /// How many reads it takes at most until a port is quiet that receives garbage.
 const QUIET_READS: u32 = 16;
 
-/// What came back.
+/// The received bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Heard {
     /// The reply, or the echo of a message without a reply.

@@ -129,7 +129,7 @@ struct Bench {
     written: Vec<u8>,
     /// The blocks that the model took.
     taken: Vec<Vec<u8>>,
-    /// How many of them the host knows to be done. `None`: their numbers of four bits do not tell.
+    /// How many of them the host knows to be done. `None`: their numbers of four bits do not show it.
     known: Option<u32>,
     /// Somebody wrote FORCE_SHUTDOWN, which is no bytes for the MCU.
     is_forced: bool,
@@ -251,7 +251,7 @@ impl Bench {
         }
     }
 
-    /// What the link does when it wakes.
+    /// The link's work when it wakes.
     fn turn(&mut self) {
         // The link would wait for room for its own requests.
         while self.link.core.requests.slots() < 4 {

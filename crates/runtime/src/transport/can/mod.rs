@@ -43,7 +43,7 @@ const FRAMES_MAX: usize = 256;
 const NAME_ONE: &str = "name a CAN interface (ip link show type can)";
 /// A frame of another kind than 11-bit data never fits this.
 const FILTER_MASK: u32 = libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
-/// Which errors the interface shall tell.
+/// Which errors the interface shall report.
 const ERRORS: u32 =
     libc::CAN_ERR_LOSTARB | CRTL | libc::CAN_ERR_ACK | BUSOFF | libc::CAN_ERR_BUSERROR | RESTARTED | CNT;
 const CRTL: u32 = libc::CAN_ERR_CRTL;
@@ -96,7 +96,7 @@ pub fn uuid() -> Result<CanbusUuid, Trouble> {
 ///
 /// The kernel has no CAN, this program may not use it, or the interface is of another kind.
 pub fn can_open(interface: &str) -> Result<(), Trouble> {
-    // In the service without its drop-in there are no interfaces either. This error tells more.
+    // In the service without its drop-in there are no interfaces either. This error says more.
     let opened = socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, SockProtocol::CanRaw);
     opened.map_err(|error| refusal(interface, error.into()))?;
     if can::is_other(interface) {
@@ -149,8 +149,8 @@ impl CanBus {
         socket.set_nonblocking(true)?;
         socket.set_error_filter(ERRORS)?;
         self.filter(&socket)?;
-        // The kernel's smallest buffer holds fewer frames than an interface's queue. So the socket tells when there is
-        // room for more, and the queue is never full of ours.
+        // The kernel's smallest buffer holds fewer frames than an interface's queue. So the socket reports when there
+        // is room for more, and the queue is never full of ours.
         setsockopt(&socket, sockopt::SndBuf, &0)?;
         Ok(socket)
     }
@@ -267,7 +267,7 @@ impl CanBus {
         let Some(frame) = frame(ADMIN_ANSWER_ID, &self.node.need_nodeid()) else { return };
         match socket.write_frame(&frame) {
             Err(error) if is_full(&error) => self.full_until = Some(monotonic() + FULL_PAUSE),
-            // A read tells more. The host asks again.
+            // A read gives the cause. The host asks again.
             _ => self.owes_answer = false,
         }
     }
@@ -391,13 +391,13 @@ impl Link for CanBus {
             match socket.write_frame(&frame) {
                 Ok(()) => written += data.len(),
                 Err(error) if error.raw_os_error() == Some(libc::ENOBUFS) => {
-                    // Frames of other programs fill the queue. The socket does not tell when there is room.
+                    // Frames of other programs fill the queue. The socket does not report when there is room.
                     self.full_until = Some(monotonic() + FULL_PAUSE);
                     break;
                 }
                 Err(error) if is_full(&error) => break,
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                // A read tells that the interface is down or gone. The host asks again for what is lost.
+                // A read reports that the interface is down or gone. The host asks again for what is lost.
                 Err(_) => return Ok(bytes.len()),
             }
         }

@@ -73,7 +73,7 @@ fn fasthash64(bytes: &[u8], seed: u64) -> u64 {
     }))
 }
 
-/// What a frame means for the node.
+/// The effect of a frame on the node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Meaning {
     /// Nothing.
@@ -101,7 +101,7 @@ impl Node {
         Node { assigned_id: None, shared }
     }
 
-    /// What the core knows about the node.
+    /// The node's state, for the core.
     pub(super) fn shared(&self) -> &Arc<CanNode> {
         &self.shared
     }
