@@ -5,7 +5,9 @@
 
 #![forbid(unsafe_code)]
 
-use std::iter;
+mod gather;
+mod text;
+
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -13,15 +15,11 @@ use clap::Args;
 use serde::Serialize;
 
 use pinion_linux::Inventory;
-use pinion_linux::adc::IioDevice;
 use pinion_linux::gpio::{Chip, FastGpio};
-use pinion_linux::pins::{Names, channel_number, line_number, pwm_number};
-use pinion_linux::spi::Node;
-use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
-use pinion_linux::uart::Uart;
+use pinion_linux::sysfs::Sysfs;
 
 use super::failed;
-use super::page::{Page, aligned, print};
+use super::page::{Page, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
@@ -236,337 +234,25 @@ struct SerialEntry {
 }
 
 impl List {
-    /// The wanted part of everything that was found. `reading` reads a channel (its driver's name) of a device (its
-    /// number). `fast` returns the node of a chip's registers.
-    fn new(
-        inventory: &Inventory,
-        sysfs: &Sysfs,
-        args: &PinsArgs,
-        reading: &dyn Fn(u32, &str) -> Reading,
-        fast: &dyn Fn(&Chip) -> Option<String>,
-    ) -> List {
-        let names = Names::of(inventory);
-        let mut list = List {
-            gpio: inventory
-                .chips
-                .iter()
-                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, inventory, sysfs, &names, args) })
-                .collect(),
-            adc: vec![],
-            pwm: vec![],
-            spi: vec![],
-            i2c: vec![],
-            w1: vec![],
-            serial: vec![],
-            problems: inventory.problems.iter().map(ToString::to_string).collect(),
-        };
-        if !args.free {
-            list.adc = inventory.adcs.iter().map(|device| adc(device, &names, args, reading)).collect();
-            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, &names, args)).collect();
-            list.spi = inventory.spi.iter().filter_map(|node| spi(*node, args)).collect();
-            list.i2c = sysfs.i2c.iter().filter_map(|bus| i2c(bus, args)).collect();
-            let sensors = sysfs.thermometers.iter().filter(|serial| wanted(args, [serial.as_str(), "w1", "ds18b20"]));
-            list.w1 = sensors.map(|serial| W1Sensor { serial_no: serial.clone() }).collect();
-            list.serial = inventory.uarts.iter().filter_map(|uart| serial(uart, args)).collect();
-        }
-        list.gpio.retain(|chip| !chip.lines.is_empty());
-        list.adc.retain(|device| !device.channels.is_empty());
-        list.pwm.retain(|chip| !chip.channels.is_empty());
-        list
-    }
-
     fn json(&self) -> String {
         match serde_json::to_string_pretty(self) {
             Ok(json) => json + "\n",
             Err(error) => unreachable!("maps of texts are JSON: {error}"),
         }
     }
-
-    fn page(&self) -> Page {
-        let gpio = self.gpio.iter().map(gpio_section);
-        let adc = self.adc.iter().map(adc_section);
-        let pwm = self.pwm.iter().map(pwm_section);
-        let buses = [spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)];
-        let sections = gpio.chain(adc).chain(pwm).chain(buses).chain([serial_section(&self.serial)]);
-        let mut page = Page::default();
-        for section in sections.filter(|section| !section.is_empty()) {
-            if !page.is_empty() {
-                page.line("");
-            }
-            page.append(&section);
-        }
-        page
-    }
-}
-
-/// Whether the filter of the command line is part of any of the names.
-fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool {
-    let Some(filter) = &args.filter else {
-        return true;
-    };
-    let filter = filter.to_lowercase();
-    names.into_iter().any(|name| name.to_lowercase().contains(&filter))
-}
-
-fn gpio(chip: &Chip, inventory: &Inventory, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
-    let path = format!("gpiochip{}", chip.number);
-    let mut lines = Vec::new();
-    for (offset, line) in (0..).zip(&chip.lines) {
-        let number = line_number(chip.number, offset);
-        let full = format!("{path}/gpio{offset}");
-        let numbered = match number {
-            // The lines of gpiochip0 have the short names.
-            Some(number) if number == offset => format!("gpio{offset}"),
-            _ => full.clone(),
-        };
-        let mut pins = number.map_or_else(Vec::new, |n| names.of_pin(n));
-        pins.retain(|name| *name != numbered);
-        let mut pins: Vec<String> = pins.into_iter().map(str::to_owned).collect();
-        // The numeric name comes second. The first name is the line's own, if it has one.
-        pins.insert(pins.len().min(1), numbered);
-        pins.extend(inventory.former_names(chip, offset));
-        let line = GpioLine {
-            line: offset,
-            name: line.name.clone(),
-            direction: if line.output { "out" } else { "in" },
-            held: line.held,
-            consumer: line.consumer.clone(),
-            device: sysfs.devices.get(&(chip.label.clone(), offset)).cloned(),
-            pins,
-        };
-        let known = [full.as_str(), &chip.label].into_iter().chain(line.name.as_deref());
-        let known = known.chain(line.pins.iter().map(String::as_str));
-        if wanted(args, known) && (line.is_free() || !args.free) {
-            lines.push(line);
-        }
-    }
-    GpioChip {
-        chip: path,
-        label: chip.label.clone(),
-        line_count: chip.lines.len(),
-        behind_bus: chip.sleeps,
-        fast: None,
-        lines,
-    }
-}
-
-fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> AdcDevice {
-    let mut channels = Vec::new();
-    for (position, channel) in device.channels.iter().enumerate() {
-        let number = channel_number(device.number, position, &channel.id);
-        let mut pins: Vec<String> =
-            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
-        if let (0, Some(n)) = (device.number, channel.id.strip_prefix("voltage"))
-            && n.parse::<u32>().is_ok_and(|n| n < 8)
-        {
-            pins.push(format!("analog{n}"));
-        }
-        // The name iioN/voltageM is shown only for devices that share their other name.
-        if pins.len() > 1 {
-            pins.retain(|name| !name.starts_with(&format!("iio{}/", device.number)));
-        }
-        let known = [device.name.as_str(), &channel.id];
-        if wanted(args, known.into_iter().chain(pins.iter().map(String::as_str))) {
-            channels.push(AdcChannel {
-                channel: channel.id.clone(),
-                resolution: channel.format.map(|format| format.to_string()),
-                reading: reading(device.number, &channel.id),
-                pins,
-            });
-        }
-    }
-    AdcDevice {
-        device: format!("iio:device{}", device.number),
-        name: device.name.clone(),
-        channel_count: device.channels.len(),
-        channels,
-    }
-}
-
-fn pwm(chip: &PwmChip, names: &Names, args: &PinsArgs) -> PwmEntry {
-    let name = format!("pwmchip{}", chip.number);
-    let mut channels = Vec::new();
-    for (channel, found) in (0..).zip(&chip.channels) {
-        let full = format!("{name}/pwm{channel}");
-        let number = pwm_number(chip.number, channel);
-        let mut pins: Vec<String> =
-            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
-        pins.extend(number.map(|_| full.clone()));
-        if wanted(
-            args,
-            [full.as_str()].into_iter().chain(chip.device.as_deref()).chain(pins.iter().map(String::as_str)),
-        ) {
-            channels.push(PwmLine {
-                channel,
-                exported: found.exported,
-                consumer: found.consumer.clone(),
-                pin: number.map(|_| full),
-                pins,
-            });
-        }
-    }
-    PwmEntry { chip: name, device: chip.device.clone(), channels }
-}
-
-fn spi(node: Node, args: &PinsArgs) -> Option<SpiDevice> {
-    let name = node.to_string();
-    wanted(args, [name.as_str(), "spi"]).then(|| SpiDevice { device: format!("/dev/{name}"), spi_bus: name })
-}
-
-fn i2c(bus: &I2cBus, args: &PinsArgs) -> Option<I2cEntry> {
-    let (device, i2c_bus) = (format!("/dev/i2c-{}", bus.number), format!("i2c.{}", bus.number));
-    let names = [device.as_str(), &i2c_bus].into_iter().chain(bus.adapter.as_deref());
-    let chip = |I2cChip { address, name, driver }: &I2cChip| I2cDevice {
-        address: *address,
-        name: name.clone(),
-        driver: driver.clone(),
-    };
-    wanted(args, names.chain(bus.chips.iter().map(|chip| chip.name.as_str()))).then(|| I2cEntry {
-        adapter: bus.adapter.clone(),
-        chips: bus.chips.iter().map(chip).collect(),
-        i2c_bus,
-        device,
-    })
-}
-
-fn serial(uart: &Uart, args: &PinsArgs) -> Option<SerialEntry> {
-    let names = [uart.name.as_str(), "serial", "uart"].into_iter().chain(uart.links.iter().map(String::as_str));
-    wanted(args, names).then(|| SerialEntry {
-        device: format!("/dev/{}", uart.name),
-        console: uart.is_console,
-        uart_pin: uart.name.clone(),
-        links: uart.links.clone(),
-    })
-}
-
-/// A heading and a table. Nothing if there are no rows.
-fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> Page {
-    let mut page = Page::default();
-    if rows.is_empty() {
-        return page;
-    }
-    page.line(heading);
-    let titles = titles.iter().map(|title| (*title).to_owned()).collect();
-    let rows: Vec<Vec<String>> = iter::once(titles).chain(rows.iter().cloned()).collect();
-    aligned(&rows).iter().for_each(|line| page.line(format_args!("  {line}")));
-    page
-}
-
-/// Cuts a text to 20 characters, so that a row fits into 100 columns.
-fn cut(text: &str) -> String {
-    match text.char_indices().nth(20) {
-        Some(_) => text.chars().take(19).chain(['…']).collect(),
-        None => text.to_owned(),
-    }
-}
-
-fn gpio_section(chip: &GpioChip) -> Page {
-    let row = |line: &GpioLine| {
-        vec![
-            line.line.to_string(),
-            cut(line.name.as_deref().unwrap_or("-")),
-            line.direction.to_owned(),
-            cut(line.used_by()),
-            // The heading says what the other names look like.
-            line.pins[..line.pins.len().min(2)].join(", "),
-        ]
-    };
-    let rows: Vec<Vec<String>> = chip.lines.iter().map(row).collect();
-    let way = match &chip.fast {
-        _ if chip.behind_bus => ", behind a bus: not for steps or other timed edges".to_owned(),
-        Some(node) => format!(", fast (registers, {node}), for LEDs too"),
-        None => String::new(),
-    };
-    let heading = format!("{} {}, {} lines{way}", chip.chip, chip.label, chip.line_count);
-    section(&heading, &["line", "name", "dir", "used by", "in printer.cfg"], &rows)
-}
-
-fn adc_section(device: &AdcDevice) -> Page {
-    let row = |channel: &AdcChannel| {
-        vec![
-            channel.channel.clone(),
-            channel.resolution.clone().unwrap_or_else(|| "12 bits assumed".into()),
-            channel.reading.to_string(),
-            channel.pins.join(", "),
-        ]
-    };
-    let rows: Vec<Vec<String>> = device.channels.iter().map(row).collect();
-    let heading = format!("{} {}, {} channels", device.device, device.name, device.channel_count);
-    section(&heading, &["channel", "resolution", "reads", "in printer.cfg"], &rows)
-}
-
-fn pwm_section(chip: &PwmEntry) -> Page {
-    let row = |line: &PwmLine| {
-        let used_by = match (&line.consumer, line.exported) {
-            (Some(consumer), _) if consumer == "sysfs" => "a program",
-            (Some(consumer), _) => consumer,
-            (None, true) => "exported",
-            (None, false) => "free",
-        };
-        let pin = match line.pins.is_empty() {
-            true => "-".to_owned(),
-            false => format!("pin: {}, with hardware_pwm: True", line.pins.join(" or ")),
-        };
-        vec![line.channel.to_string(), cut(used_by), pin]
-    };
-    let rows: Vec<Vec<String>> = chip.channels.iter().map(row).collect();
-    let heading = format!("{}{}", chip.chip, chip.device.as_ref().map_or(String::new(), |device| format!(" {device}")));
-    section(&heading, &["channel", "used by", "in printer.cfg"], &rows)
-}
-
-fn spi_section(devices: &[SpiDevice]) -> Page {
-    let row = |SpiDevice { device, spi_bus }: &SpiDevice| {
-        let use_ = format!("spi_bus: {spi_bus}, for LEDs pin: {spi_bus}, for an HX711 dout_pin: {spi_bus}/miso");
-        vec![device.clone(), use_]
-    };
-    section("SPI", &["device", "in printer.cfg"], &devices.iter().map(row).collect::<Vec<_>>())
-}
-
-fn i2c_section(buses: &[I2cEntry]) -> Page {
-    let row = |bus: &I2cEntry| {
-        let taken = bus.chips.iter().filter_map(|chip| {
-            let driver = chip.driver.as_ref()?;
-            Some(format!("{:#04x} {} by {driver}", chip.address, chip.name))
-        });
-        let taken: Vec<String> = taken.collect();
-        let taken = if taken.is_empty() { "-".to_owned() } else { taken.join(", ") };
-        let adapter = cut(bus.adapter.as_deref().unwrap_or("-"));
-        vec![bus.device.clone(), adapter, taken, format!("i2c_bus: {}", bus.i2c_bus)]
-    };
-    let rows: Vec<Vec<String>> = buses.iter().map(row).collect();
-    section("I2C", &["device", "adapter", "used by the kernel", "in printer.cfg"], &rows)
-}
-
-fn w1_section(sensors: &[W1Sensor]) -> Page {
-    let row = |W1Sensor { serial_no }: &W1Sensor| {
-        vec![serial_no.clone(), format!("sensor_type: DS18B20, with serial_no: {serial_no}")]
-    };
-    section("1-Wire", &["sensor", "in printer.cfg"], &sensors.iter().map(row).collect::<Vec<_>>())
-}
-
-fn serial_section(ports: &[SerialEntry]) -> Page {
-    let row = |port: &SerialEntry| {
-        let use_ = match port.console {
-            true => "none: the kernel writes its messages there".to_owned(),
-            false => {
-                let names: Vec<&str> =
-                    iter::once(&port.uart_pin).chain(&port.links).map(String::as_str).take(2).collect();
-                format!("for TMC drivers uart_pin: {}", names.join(", or "))
-            }
-        };
-        vec![port.device.clone(), use_]
-    };
-    section("Serial ports", &["device", "in printer.cfg"], &ports.iter().map(row).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::cli::boards::{self, Board};
-    use pinion_linux::adc::{Channel, Format};
+    use pinion_linux::adc::{Channel, Format, IioDevice};
     use pinion_linux::gpio::LineInfo;
+    use pinion_linux::pins::{Names, line_number};
     use pinion_linux::pwm;
-    use pinion_linux::sysfs::PwmChannel;
+    use pinion_linux::spi::Node;
+    use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChannel, PwmChip};
+    use pinion_linux::uart::Uart;
     use pinion_testkit::names::any_name;
     use pinion_testkit::names::assert_plain;
     use proptest::prelude::*;

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pins and buses: whether they are there, whether Pinion may open them, and which processes hold the lines. Also the
-//! firmware's report about the computer's power.
+//! Pins and buses: whether they are there, and whether Pinion may open them.
 
 #![forbid(unsafe_code)]
 
@@ -8,33 +7,28 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use crate::cli::computer::device::Port;
-use crate::cli::computer::{Access, Computer, Who, output};
+use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
-use pinion_linux::Inventory;
 use pinion_linux::foreign::word;
-use pinion_linux::gpio::{Chip, FastGpio, LINK_REMEDY, never_sleeps};
-use pinion_linux::pins::{Names, line_number};
-use pinion_linux::throttled;
+use pinion_linux::gpio::{FastGpio, LINK_REMEDY, never_sleeps};
 
 use super::instance::Instance;
-use super::printer::line_of;
 use super::{INSTALL, REINSTALL};
 
 /// A kind of devices.
-struct Class {
+pub(super) struct Class {
     check: &'static str,
     name: &'static str,
-    access: Access,
+    pub(super) access: Access,
     /// udev's subsystem.
     subsystem: &'static str,
     /// The line of a Raspberry Pi's config.txt that enables it, and the beginnings of other lines that do.
     enabled_by: Option<(&'static str, &'static [&'static str])>,
     /// The files that Pinion has to open.
-    nodes: &'static str,
+    pub(super) nodes: &'static str,
 }
 
 const CLASSES: [Class; 6] = [
@@ -89,7 +83,7 @@ const CLASSES: [Class; 6] = [
 ];
 
 /// The registers of GPIO chips.
-const FAST: Class = Class {
+pub(super) const FAST: Class = Class {
     check: "fast_gpio",
     name: "fast lines",
     access: Access::READ_WRITE,
@@ -269,7 +263,7 @@ fn present(computer: &Computer, class: &Class) -> Finding {
     }
 }
 
-fn model(computer: &Computer) -> String {
+pub(super) fn model(computer: &Computer) -> String {
     computer.text("/proc/device-tree/model").unwrap_or_default()
 }
 
@@ -296,275 +290,9 @@ pub(super) fn pi_config(computer: &Computer) -> Option<&'static str> {
     computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
 }
 
-/// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
-struct Vpu {
-    models: &'static [&'static str],
-    /// How the sections of config.txt begin that apply only to these models.
-    sections: &'static [&'static str],
-    core_freq: u32,
-    /// The value of `core_freq_min` if config.txt does not set it.
-    slowest: u32,
-    lines: &'static str,
-}
-
-const VPUS: [Vpu; 3] = [
-    Vpu {
-        models: &["Pi 4", "Module 4"],
-        sections: &["pi4", "cm4"],
-        core_freq: 500,
-        slowest: 200,
-        lines: "core_freq=500\\ncore_freq_min=500",
-    },
-    Vpu {
-        models: &["Pi 3", "Module 3"],
-        sections: &["pi3", "cm3"],
-        core_freq: 400,
-        slowest: 250,
-        lines: "core_freq=250",
-    },
-    Vpu { models: &["Pi Zero"], sections: &["pi0"], core_freq: 400, slowest: 250, lines: "core_freq=250" },
-];
-
-impl Vpu {
-    /// Whether config.txt keeps the clock from changing. Sections whose condition is not the model count.
-    fn is_held(&self, config: &str) -> bool {
-        let (mut core_freq, mut slowest, mut is_forced, mut applies) = (self.core_freq, self.slowest, false, true);
-        for line in config.lines().map(str::trim) {
-            if let Some(section) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
-                let is_model = ["pi", "cm"].iter().any(|model| section.starts_with(model));
-                let is_own = self.sections.iter().any(|own| section.starts_with(own));
-                applies = section != "none" && (!is_model || is_own);
-            }
-            let Some((key, value)) = line.split_once('=').filter(|_| applies) else { continue };
-            let Ok(value) = value.trim().parse() else { continue };
-            match key.trim() {
-                "core_freq" => core_freq = value,
-                "core_freq_min" => slowest = value,
-                "force_turbo" => is_forced = value == 1,
-                _ => {}
-            }
-        }
-        is_forced || slowest >= core_freq
-    }
-}
-
-/// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
-pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
-    const CHECK: &str = "leds";
-    let model = model(computer);
-    let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
-    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(computer)) else { return Vec::new() };
-    let Some(first) = pins.first() else { return Vec::new() };
-    let text = pi_config(computer).and_then(|config| Some((config, computer.text(config)?)));
-    let Some((config, text)) = text else { return Vec::new() };
-    let lines = vpu.lines;
-    let clock = match vpu.is_held(&text) {
-        true => Finding::ok(CHECK, format!("LEDs: {config} holds the clock of SPI")),
-        false => Finding::warning(
-            CHECK,
-            format!("LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"),
-            format!("printf '[all]\\n{lines}\\n' | sudo tee -a {config}, and reboot"),
-        ),
-    };
-    let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
-    let bus = without_dma.map(|pin| {
-        let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses amid a frame");
-        Finding::warning(CHECK, found, "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0")
-    });
-    [Some(clock), bus].into_iter().flatten().collect()
-}
-
 /// Whether the GPIO chip is a Raspberry Pi 5's: its registers have a node with a number.
-fn is_rp1(computer: &Computer) -> bool {
+pub(super) fn is_rp1(computer: &Computer) -> bool {
     computer.path("/dev/gpiomem0").exists()
-}
-
-/// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
-pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(&Path, &str)>) -> Vec<Finding> {
-    let own = |link: &Path| {
-        let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-        own.find(|instance| instance.link.as_deref() == Some(link))
-    };
-    let pins = pins.iter().filter_map(|(link, pin)| Some((own(link)?, pin)));
-    pins.map(|(instance, pin)| line_led(computer, instance, pin)).collect()
-}
-
-fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
-    const CHECK: &str = "leds";
-    let refused = |why: &str, remedy: String| Finding::error(CHECK, format!("LEDs: {pin} is refused: {why}"), remedy);
-    let set = |value: &str| format!("fast_gpio = \"{value}\" in {}, then {}", instance.config(), instance.restart());
-    const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
-    if is_rp1(computer) {
-        return refused("the RP1 is behind PCIe, which may shorten or join their pulses", TO_SPI.into());
-    }
-    let nodes = computer.matching(FAST.nodes);
-    let wish = instance.settings.fast_gpio;
-    if wish == FastGpio::Off && !nodes.is_empty() {
-        return refused("fast_gpio is off", set("auto"));
-    }
-    let Some(node) = nodes.first().filter(|_| wish != FastGpio::Off) else {
-        if wish == FastGpio::DevMem {
-            return Finding::ok(CHECK, format!("LEDs: {pin} is written through /dev/mem"));
-        }
-        return refused("this computer has no fast lines (no /dev/gpiomem)", TO_SPI.into());
-    };
-    let node = computer.name(node);
-    let mut about = fs::metadata(computer.path(&node)).ok().zip(instance.user(computer)).into_iter();
-    if let Some((_, user)) = about.find(|(about, user)| wish != FastGpio::DevMem && !user.may(FAST.access, about)) {
-        let why = format!("{} may not open {}", user.name, node.display());
-        return refused(&why, set("on") + ": pinion doctor then says what is missing");
-    }
-    Finding::ok(
-        CHECK,
-        format!("LEDs: {pin} is on a fast line, if it is one of the processor's own ({})", node.display()),
-    )
-}
-
-/// The pins whose MCU is one of these instances, and has this computer's lines.
-pub(super) fn of_instances<'a>(instances: &[Instance], pins: &BTreeSet<(&Path, &'a str)>) -> BTreeSet<&'a str> {
-    let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-    let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
-    pins.iter().filter(|(link, _)| links.contains(link)).map(|(_, pin)| *pin).collect()
-}
-
-/// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
-/// have numbered its chip differently.
-pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet<&str>) -> Vec<Finding> {
-    const CHECK: &str = "gpio_numbers";
-    let chips = &inventory.chips;
-    let Some(header) = inventory.header() else {
-        if !is_pi(computer) || chips.is_empty() {
-            return Vec::new();
-        }
-        let found = "this kernel has no driver for the lines of the 40-pin header";
-        return vec![Finding::warning(CHECK, found, "boot the kernel of Raspberry Pi OS")];
-    };
-    let names = Names::of(inventory);
-    let own_name = |offset: u32| {
-        let number = line_number(header.number, offset)?;
-        names.of_pin(number).first().map(|name| (*name).to_owned())
-    };
-    // The header has had these numbers. On a Pi 5 a chip of the processor may have them. Any other chip was connected on
-    // purpose.
-    let is_other = |number: u32| {
-        let chip = chips.iter().find(|chip| chip.number == number && [0, 4].contains(&number));
-        chip.is_some_and(|chip| chip.label.starts_with("gpio-brcmstb"))
-    };
-    let (mut former, mut other) = (Vec::new(), Vec::new());
-    for pin in pins {
-        let Some((chip, offset)) = line_of(pin) else { continue };
-        let Some(name) = own_name(offset) else { continue };
-        match () {
-            () if inventory.renumbered(chip).is_some() => former.push((*pin, name)),
-            () if is_other(chip) => other.push((*pin, name)),
-            () => {}
-        }
-    }
-    let write = |pins: &[(&str, String)]| {
-        let pins: Vec<String> = pins.iter().map(|(pin, name)| format!("{name} for {pin}")).collect();
-        format!("in printer.cfg write {}", pins.join(", "))
-    };
-    let shown = format!("gpiochip{} ({})", header.number, header.label);
-    let list = |pins: &[(&str, String)]| pins.iter().map(|(pin, _)| *pin).collect::<Vec<_>>().join(", ");
-    let mut findings = Vec::new();
-    if !former.is_empty() {
-        let found = format!(
-            "the header is {shown}, and the numbers in printer.cfg are those of another kernel: Pinion takes {} for its lines",
-            list(&former)
-        );
-        findings.push(Finding::warning(CHECK, found, write(&former)));
-    }
-    if !other.is_empty() {
-        let found = format!("the header is {shown}, and these pins are lines of another chip: {}", list(&other));
-        findings.push(Finding::warning(CHECK, found, write(&other) + ", if you mean lines of the header"));
-    }
-    if findings.is_empty() {
-        findings.push(Finding::ok(CHECK, format!("the 40-pin header is {shown}")));
-    }
-    findings
-}
-
-/// The holders of GPIO lines.
-pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
-    const CHECK: &str = "gpio_lines";
-    /// `pinion pins` lists more.
-    const SHOWN: usize = 8;
-    let chip = |chip: &Chip| {
-        let held = (0u32..).zip(&chip.lines).filter(|(_, line)| line.held);
-        let mut held: Vec<String> = held
-            .map(|(offset, line)| format!("{offset} by \"{}\"", line.consumer.as_deref().unwrap_or("the kernel")))
-            .collect();
-        let count = held.len();
-        held.truncate(SHOWN);
-        let more = if count > SHOWN { ", ... (pinion pins lists all)" } else { "" };
-        let colon = if count > 0 { ": " } else { "" };
-        let (number, label, lines) = (chip.number, &chip.label, chip.lines.len());
-        let list = held.join(", ");
-        Finding::ok(CHECK, format!("gpiochip{number} {label}: {count} of {lines} lines are held{colon}{list}{more}"))
-    };
-    let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
-    let programs: Vec<String> = computer
-        .all_processes()
-        .iter()
-        .filter(|process| {
-            let folder = computer.path(format!("/proc/{}/fd", process.pid));
-            let files = fs::read_dir(folder).into_iter().flatten().flatten();
-            let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
-            // The target is of one line, of several lines, or of a line with edges (drivers/gpio/gpiolib-cdev.c).
-            targets.any(|target| target.to_string_lossy().starts_with("anon_inode:gpio"))
-        })
-        .map(|process| {
-            let program = process.arguments.first().and_then(|program| program.file_name());
-            format!("{} (process {})", program.unwrap_or_default().to_string_lossy(), process.pid)
-        })
-        .collect();
-    if !programs.is_empty() {
-        findings.push(Finding::ok(CHECK, format!("programs that hold lines: {}", programs.join(", "))));
-    }
-    findings
-}
-
-/// The report of a Raspberry Pi's firmware about its power and temperature. `vcgencmd` is the program that asks the
-/// firmware, if it may be started.
-pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding> {
-    const CHECK: &str = "power";
-    let Some(bits) = throttled_bits(computer, vcgencmd) else {
-        return match is_pi(computer) {
-            true => {
-                vec![Finding::warning(CHECK, "whether the power is good is unknown", "sudo vcgencmd get_throttled")]
-            }
-            false => vec![Finding::ok(CHECK, "whether the power is good is unknown: this is no Raspberry Pi")],
-        };
-    };
-    let states = [
-        (0, "the voltage is too low", "use a better power supply and a short, thick cable"),
-        (1, "the processors' frequency is capped", "use a better power supply, or cool the computer"),
-        (2, "the processors are throttled", "use a better power supply, or cool the computer"),
-        (3, "the processors are at their temperature limit", "cool the computer"),
-    ];
-    let mut findings = Vec::new();
-    for (bit, what, remedy) in states {
-        let is = |bit: u32| bits >> bit & 1 == 1;
-        if is(bit) {
-            findings.push(Finding::error(CHECK, format!("{what}: steps are late and outputs fail"), remedy));
-        } else if is(16 + bit) {
-            findings.push(Finding::warning(CHECK, format!("since it was started, at times {what}"), remedy));
-        }
-    }
-    if findings.is_empty() {
-        findings.push(Finding::ok(CHECK, "voltage and temperature were good since the computer was started"));
-    }
-    findings
-}
-
-/// The firmware's bits, from sysfs or from vcgencmd.
-fn throttled_bits(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
-    let files = computer.matching(throttled::FILES);
-    if let Some(bits) = files.iter().find_map(|file| computer.text(computer.name(file))) {
-        return throttled::bits(&bits);
-    }
-    let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
-    throttled::bits(told.trim().strip_prefix("throttled=")?)
 }
 
 #[cfg(test)]
@@ -572,10 +300,9 @@ mod tests {
     use super::super::instance::instances;
     use super::super::tests::told;
     use super::*;
-    use crate::cli::boards::{self, Board};
+    use crate::cli::boards;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
-    use pinion_linux::gpio::LineInfo;
     use std::os::unix::fs::MetadataExt;
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
@@ -738,124 +465,6 @@ mod tests {
     }
 
     #[test]
-    fn leds_on_a_pi_need_a_clock_that_is_held() {
-        let judged = |model: &str, config: &str, pin: &str| {
-            let tree = Tree::new();
-            tree.put("proc/device-tree/model", model);
-            tree.put("boot/firmware/config.txt", config);
-            leds(&tree.computer(), &[pin].into())
-        };
-        for (model, held, loose, remedy) in [
-            (
-                "Raspberry Pi 4 Model B Rev 1.4\0",
-                &["core_freq=500\ncore_freq_min=500\n", "[pi4]\ncore_freq_min = 500\n", "force_turbo=1\n"][..],
-                &["", "core_freq=500\n", "[pi3]\ncore_freq_min=500\n", "#core_freq_min=500\n", "[none]\nforce_turbo=1"]
-                    [..],
-                "core_freq=500\\ncore_freq_min=500",
-            ),
-            (
-                "Raspberry Pi 3 Model B Plus Rev 1.3\0",
-                &["core_freq=250\n", "[pi3+]\ncore_freq=250\n", "[pi4]\n[all]\ncore_freq=250"][..],
-                &["", "core_freq=400\n", "[pi4]\ncore_freq=250\n"][..],
-                "core_freq=250",
-            ),
-            ("Raspberry Pi Zero 2 W Rev 1.0\0", &["core_freq=250\n"][..], &[""][..], "core_freq=250"),
-        ] {
-            for config in held {
-                told(
-                    &judged(model, config, "host:spidev0.0"),
-                    "leds",
-                    Fine,
-                    "/boot/firmware/config.txt holds the clock",
-                );
-            }
-            for config in loose {
-                let findings = judged(model, config, "host:spidev0.0");
-                assert!(
-                    told(&findings, "leds", Warning, "of host:spidev0.0 may be white").contains(remedy),
-                    "{config}"
-                );
-                assert_eq!(findings.len(), 1);
-            }
-        }
-        let findings = judged("Raspberry Pi 4", "force_turbo=1", "host:spidev1.0");
-        assert!(told(&findings, "leds", Warning, "of host:spidev1.0 has no DMA").contains("SPI0"));
-        assert!(judged("Raspberry Pi 5 Model B", "", "host:spidev0.0").is_empty(), "its SPI has a clock of its own");
-        assert!(judged("Raspberry Pi 2", "", "host:spidev0.0").is_empty(), "its VPU has one clock");
-        assert!(judged("Pine64", "", "host:spidev0.0").is_empty());
-        let tree = Tree::new();
-        tree.put("proc/device-tree/model", "Raspberry Pi 4");
-        tree.put("boot/config.txt", "");
-        assert!(leds(&tree.computer(), &BTreeSet::new()).is_empty(), "there are no LEDs");
-    }
-
-    #[test]
-    fn leds_on_a_line_need_registers() {
-        let judged = |nodes: &[(&str, u32)], settings: &str, pin: &str| {
-            let tree = Tree::new();
-            tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
-            tree.put("etc/pinion/pinion.toml", settings);
-            nodes.iter().for_each(|(node, mode)| tree.put_mode(node, "", *mode));
-            let pins = [(Path::new("/tmp/klipper_host_mcu"), pin), (Path::new("/dev/board"), "PA1")];
-            line_leds(&tree.computer(), &instances(&tree.computer()).0, &pins.into())
-        };
-        let refused = |nodes: &[(&str, u32)], settings: &str, why: &str| {
-            let findings = judged(nodes, settings, "host:gpio18");
-            assert_eq!(findings.len(), 1, "{findings:?}");
-            told(&findings, "leds", Error, &format!("host:gpio18 is refused: {why}"))
-        };
-        let (pi_4, pi_5) = (("dev/gpiomem", 0o666), ("dev/gpiomem0", 0o666));
-        told(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
-        told(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
-        assert!(refused(&[], "", "this computer has no fast lines").contains("spidev0.0"));
-        assert!(refused(&[], "fast_gpio = \"off\"\n", "this computer has no fast lines").contains("spidev0.0"));
-        assert!(
-            refused(&[pi_4], "fast_gpio = \"off\"\n", "fast_gpio is off").contains("fast_gpio = \"auto\" in /etc/")
-        );
-        for settings in ["", "fast_gpio = \"on\"\n", "fast_gpio = \"off\"\n", "fast_gpio = \"/dev/mem\"\n"] {
-            assert!(refused(&[pi_5], settings, "the RP1 is behind PCIe").contains("spidev0.0"));
-        }
-        refused(&[("dev/gpiomem", 0o600)], "", "pinion may not open /dev/gpiomem");
-        assert!(judged(&[], "board = \"sim\"\n", "host:gpio18").is_empty(), "the simulated printer has any LEDs");
-    }
-
-    /// The findings about the header of a board, with these pins in printer.cfg.
-    fn about_header(board: &Board, pins: &[&str]) -> Vec<Finding> {
-        let tree = board.tree();
-        header(&tree.computer(), &board.inventory(&tree), &pins.iter().copied().collect())
-    }
-
-    #[test]
-    fn a_header_whose_chip_has_another_number() {
-        let numbered = ["gpio17", "gpiochip4/gpio33"];
-        let remedy = told(
-            &about_header(&boards::pi5(), &numbered),
-            "gpio_numbers",
-            Warning,
-            "the header is gpiochip15 (pinctrl-rp1), and the numbers in printer.cfg are those of another kernel: Pinion \
-             takes gpio17, gpiochip4/gpio33 for its lines",
-        );
-        assert_eq!(remedy, "in printer.cfg write GPIO17 for gpio17, pinctrl-rp1/gpio33 for gpiochip4/gpio33");
-        for pins in [&[][..], &["gpiochip15/gpio17"], &["gpiochip11/gpio1"], &["gpio99"]] {
-            let findings = about_header(&boards::pi5(), pins);
-            assert!(findings.len() == 1 && findings[0].told.remedy.is_none(), "{findings:?}");
-            told(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
-        }
-        // gpio17 is a line of the processor's own chip there.
-        let findings = about_header(&boards::pi5_debian(), &numbered);
-        let remedy = told(&findings, "gpio_numbers", Warning, "these pins are lines of another chip: gpio17");
-        assert_eq!(remedy, "in printer.cfg write pinctrl-rp1/gpio17 for gpio17, if you mean lines of the header");
-        assert_eq!(findings.len(), 1, "gpiochip4 is the header");
-        let findings = about_header(&boards::pi5_without_header(), &[]);
-        assert!(told(&findings, "gpio_numbers", Warning, "no driver for the lines").contains("Raspberry Pi OS"));
-        told(&about_header(&boards::pi4(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2711)");
-        told(&about_header(&boards::zero2(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2835)");
-        for board in [boards::cb1(), boards::rk3566()] {
-            assert_eq!(about_header(&board, &["gpio17"]), [], "it has no header of a Raspberry Pi");
-        }
-    }
-
-    #[test]
     fn only_a_raspberry_pi_has_a_config_txt() {
         for board in [boards::cb1(), boards::rk3566()] {
             let findings = presence(&board.tree().computer());
@@ -869,77 +478,5 @@ mod tests {
         for board in boards::all() {
             told(&presence(&board.tree().computer()), "gpio", Fine, "GPIO: /dev/gpiochip");
         }
-    }
-
-    /// Only pins of an MCU that has this computer's lines count.
-    #[test]
-    fn pins_of_another_micro_controller() {
-        let tree = Tree::new();
-        tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
-        let (host, board) = (Path::new("/tmp/klipper_host_mcu"), Path::new("/dev/board"));
-        let pins = || of_instances(&instances(&tree.computer()).0, &[(host, "gpio17"), (board, "gpio18")].into());
-        assert_eq!(pins(), ["gpio17"].into());
-        tree.put("etc/pinion/pinion.toml", "board = \"sim\"\n");
-        assert!(pins().is_empty());
-    }
-
-    #[test]
-    fn who_holds_which_line() {
-        let tree = Tree::new();
-        let line = |consumer: Option<&str>, held| LineInfo {
-            held,
-            consumer: consumer.map(str::to_owned),
-            ..LineInfo::default()
-        };
-        let chip = Chip {
-            number: 0,
-            label: "pinctrl".into(),
-            sleeps: false,
-            lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
-        };
-        let findings = holders(&tree.computer(), std::slice::from_ref(&chip));
-        told(
-            &findings,
-            "gpio_lines",
-            Fine,
-            "gpiochip0 pinctrl: 2 of 3 lines are held: 0 by \"spi0 CS0\", 2 by \"the kernel\"",
-        );
-        assert_eq!(findings.len(), 1);
-        tree.process(77, &["/usr/bin/gpiomon", "17"], 1000, &[]);
-        tree.link("proc/77/fd/3", "anon_inode:gpio-line");
-        tree.process(78, &["/usr/bin/other"], 1000, &[]);
-        tree.link("proc/78/fd/3", "/dev/null");
-        told(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
-        let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
-        told(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
-    }
-
-    #[test]
-    fn a_pi_tells_of_its_power() {
-        let tree = Tree::new();
-        told(&power(&tree.computer(), None), "power", Fine, "unknown: this is no Raspberry Pi");
-        tree.put("proc/device-tree/model", "Raspberry Pi 3");
-        told(&power(&tree.computer(), None), "power", Warning, "unknown");
-        let file = "sys/devices/platform/soc/soc:firmware/get_throttled";
-        tree.put(file, "0\n");
-        told(&power(&tree.computer(), None), "power", Fine, "were good");
-        tree.put(file, "50001\n");
-        let findings = power(&tree.computer(), None);
-        told(&findings, "power", Error, "the voltage is too low");
-        told(&findings, "power", Warning, "at times the processors are throttled");
-        assert_eq!(findings.len(), 2);
-    }
-
-    #[test]
-    fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
-        let tree = Tree::new();
-        let told_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
-        let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
-        told(&good, "power", Warning, "at times the processors are at their temperature limit");
-        tree.put("proc/device-tree/model", "Raspberry Pi 3");
-        for script in ["#!/bin/sh\nexec sleep 1000\n", "#!/bin/sh\necho nonsense\n", "not a program"] {
-            told(&told_by(script), "power", Warning, "unknown");
-        }
-        told(&power(&tree.computer(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
     }
 }

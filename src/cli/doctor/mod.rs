@@ -28,7 +28,10 @@ mod instance;
 mod kernel;
 mod klipper;
 mod last_stop;
+mod leds;
+mod lines;
 mod outputs;
+mod power;
 pub(super) mod printer;
 mod serial;
 mod service;
@@ -107,23 +110,23 @@ fn examine(computer: &Computer) -> Vec<Group> {
             [
                 devices::presence(computer),
                 outputs::released(computer),
-                devices::leds(computer, &host::leds(&klippys)),
-                devices::line_leds(computer, &instances, &host::line_leds(&klippys)),
+                leds::leds(computer, &host::leds(&klippys)),
+                leds::line_leds(computer, &instances, &host::line_leds(&klippys)),
                 serial::ports(computer, &host::uarts(&klippys)),
                 add::missing(computer, &klippys.iter().filter_map(|klippy| klippy.config.clone()).collect()),
             ]
             .concat(),
         ),
         Group::new("permissions", devices::permissions(computer, &instances, &host::uarts(&klippys))),
-        Group::new("power", devices::power(computer, program("/usr/bin/vcgencmd"))),
+        Group::new("power", power::power(computer, program("/usr/bin/vcgencmd"))),
     ];
     if computer.is_this() {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
         let inventory = Inventory::scan();
         let pins = host::numbered_pins(&klippys);
         let lines = [
-            devices::header(computer, &inventory, &devices::of_instances(&instances, &pins)),
-            devices::holders(computer, &inventory.chips),
+            lines::header(computer, &inventory, &lines::of_instances(&instances, &pins)),
+            lines::holders(computer, &inventory.chips),
         ];
         groups.insert(7, Group::new("lines", lines.concat()));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));

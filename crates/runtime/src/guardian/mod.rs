@@ -239,7 +239,7 @@ mod tests {
     use nix::sys::resource::{Resource, setrlimit};
     use std::fs::{self, File};
     use std::io::{BufRead, BufReader};
-    use std::path::{Path, PathBuf};
+    use std::os::unix::process::ExitStatusExt;
     use std::process::{Child, Command, Stdio};
     use std::thread;
 
@@ -257,31 +257,70 @@ mod tests {
         }
     }
 
-    /// A guarded program. It is killed when its test fails.
-    struct Guarded(Child);
+    /// A guarded program: this test program itself, with an output in a file. It is killed when its test fails.
+    struct Guarded {
+        program: Child,
+        guardian: u32,
+        folder: tempfile::TempDir,
+    }
 
-    impl Drop for Guarded {
-        fn drop(&mut self) {
-            let _ = self.0.kill();
-            let _ = self.0.wait();
+    impl Guarded {
+        fn start(script: &str) -> Guarded {
+            let folder = tempfile::tempdir().unwrap();
+            let file = folder.path().join("output");
+            fs::write(&file, "on ").unwrap();
+            let mut program = Command::new(std::env::current_exe().unwrap())
+                .args(["--ignored", "--exact", "guardian::tests::guarded_program"])
+                .args(["--test-threads=1", "--nocapture"])
+                .env("GUARDED_SCRIPT", script)
+                .env("GUARDED_FILE", file)
+                .stdout(Stdio::piped())
+                .stderr(File::create(folder.path().join("log")).unwrap())
+                .spawn()
+                .unwrap();
+            let lines = BufReader::new(program.stdout.as_mut().unwrap()).lines();
+            let guardian = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("guardian ")?.parse().ok());
+            Guarded { program, guardian: guardian.expect("the guarded program says who guards it"), folder }
+        }
+
+        /// Kills the program, and waits until its guardian has ended.
+        fn kill(&mut self) {
+            self.program.kill().unwrap();
+            self.wait_for_the_guardian();
+        }
+
+        fn wait_for_the_guardian(&mut self) {
+            let until = monotonic() + Duration::from_secs(60);
+            while !is_gone(self.guardian) {
+                assert!(monotonic() < until, "the guardian does not end");
+                thread::sleep(5 * MS);
+            }
+        }
+
+        /// Waits for the program's end, and returns the signal that ended it.
+        fn signal(&mut self) -> Option<i32> {
+            self.program.wait().unwrap().signal()
+        }
+
+        fn output(&self) -> String {
+            fs::read_to_string(self.folder.path().join("output")).unwrap()
+        }
+
+        fn log(&self) -> String {
+            fs::read_to_string(self.folder.path().join("log")).unwrap()
         }
     }
 
-    /// Starts this test program itself as a guarded program.
-    fn start(script: &str, file: &Path) -> (Guarded, u32) {
-        fs::write(file, "on ").unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "guardian::tests::guarded_program"])
-            .args(["--test-threads=1", "--nocapture"])
-            .env("GUARDED_SCRIPT", script)
-            .env("GUARDED_FILE", file)
-            .stdout(Stdio::piped())
-            .stderr(File::create(log_of(file)).unwrap())
-            .spawn()
-            .unwrap();
-        let lines = BufReader::new(child.stdout.as_mut().unwrap()).lines();
-        let guardian = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("guardian ")?.parse().ok());
-        (Guarded(child), guardian.expect("the guarded program says who guards it"))
+    impl Drop for Guarded {
+        fn drop(&mut self) {
+            let _ = self.program.kill();
+            let _ = self.program.wait();
+        }
+    }
+
+    fn is_gone(pid: u32) -> bool {
+        // An orphan's zombie may wait for an init that does not care.
+        fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| stat.contains(") Z "))
     }
 
     #[test]
@@ -323,112 +362,66 @@ mod tests {
         }
     }
 
-    fn wait_until(what: &str, condition: impl Fn() -> bool) {
-        let until = monotonic() + Duration::from_secs(60);
-        while !condition() {
-            assert!(monotonic() < until, "waited in vain: {what}");
-            thread::sleep(5 * MS);
-        }
-    }
-
-    fn is_gone(pid: u32) -> bool {
-        // An orphan's zombie may wait for an init that does not care.
-        fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| stat.contains(") Z "))
-    }
-
-    fn content(file: &Path) -> String {
-        fs::read_to_string(file).unwrap()
-    }
-
-    /// A file, in a folder of its own.
-    fn file() -> (tempfile::TempDir, PathBuf) {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("output");
-        (folder, file)
-    }
-
-    fn log_of(file: &Path) -> PathBuf {
-        file.with_extension("log")
-    }
-
     #[test]
     fn a_killed_program_s_outputs_go_to_their_shutdown_values() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("sleep", &file);
-        let comm = fs::read_to_string(format!("/proc/{guardian}/comm")).unwrap();
+        let mut guarded = Guarded::start("sleep");
+        let comm = fs::read_to_string(format!("/proc/{}/comm", guarded.guardian)).unwrap();
         assert_eq!(comm, "pinion-guardian\n");
-        assert_eq!(content(&file), "on ");
-        program.0.kill().unwrap();
-        wait_until("driven", || content(&file) == "off");
-        wait_until("the guardian ends", || is_gone(guardian));
-        program.0.wait().unwrap();
+        assert_eq!(guarded.output(), "on ");
+        guarded.kill();
+        assert_eq!(guarded.output(), "off");
     }
 
     #[test]
     fn an_output_that_is_given_again_goes_to_the_later_value() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("again", &file);
-        program.0.kill().unwrap();
-        wait_until("the guardian ends", || is_gone(guardian));
-        assert_eq!(content(&file), "off");
-        assert!(content(&log_of(&file)).contains("all 1 outputs are driven"));
-        program.0.wait().unwrap();
+        let mut guarded = Guarded::start("again");
+        guarded.kill();
+        assert_eq!(guarded.output(), "off");
+        assert!(guarded.log().contains("all 1 outputs are driven"));
     }
 
     #[test]
     fn an_output_that_can_not_be_driven_is_named() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("readonly", &file);
-        program.0.kill().unwrap();
-        wait_until("the guardian ends", || is_gone(guardian));
-        let log = content(&log_of(&file));
+        let mut guarded = Guarded::start("readonly");
+        guarded.kill();
+        let log = guarded.log();
         assert!(
             log.contains("still not at its shutdown value: pwmchip7/pwm0: Bad file descriptor (os error 9)"),
             "{log}"
         );
         assert!(log.contains("only 0 of 1 outputs are driven") && log.contains("switch the power off"), "{log}");
-        program.0.wait().unwrap();
     }
 
     #[test]
     fn a_guardian_without_memory_for_threads_drives_the_outputs_all_the_same() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("cramped", &file);
-        program.0.kill().unwrap();
-        wait_until("the guardian ends", || is_gone(guardian));
-        assert_eq!(content(&file), "off");
-        assert!(content(&log_of(&file)).contains("all 1 outputs are driven"));
-        program.0.wait().unwrap();
+        let mut guarded = Guarded::start("cramped");
+        guarded.kill();
+        assert_eq!(guarded.output(), "off");
+        assert!(guarded.log().contains("all 1 outputs are driven"));
     }
 
     #[test]
     fn an_aborted_program_s_outputs_go_to_their_shutdown_values() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("abort", &file);
-        wait_until("driven", || content(&file) == "off");
-        wait_until("the guardian ends", || is_gone(guardian));
-        program.0.wait().unwrap();
+        let mut guarded = Guarded::start("abort");
+        guarded.wait_for_the_guardian();
+        assert_eq!(guarded.output(), "off");
     }
 
     #[test]
     fn a_program_that_hangs_is_killed_and_its_outputs_driven() {
-        use std::os::unix::process::ExitStatusExt;
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("hang", &file);
-        wait_until("driven", || content(&file) == "off");
-        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
-        wait_until("the guardian ends", || is_gone(guardian));
+        let mut guarded = Guarded::start("hang");
+        assert_eq!(guarded.signal(), Some(9));
+        guarded.wait_for_the_guardian();
+        assert_eq!(guarded.output(), "off");
     }
 
     #[test]
     fn an_output_that_does_not_get_its_shutdown_value_is_named_and_the_program_killed() {
-        use std::os::unix::process::ExitStatusExt;
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("owe", &file);
-        wait_until("driven", || content(&file) == "off");
-        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
-        wait_until("the guardian ends", || is_gone(guardian));
-        let log = content(&log_of(&file));
+        let mut guarded = Guarded::start("owe");
+        assert_eq!(guarded.signal(), Some(9));
+        guarded.wait_for_the_guardian();
+        assert_eq!(guarded.output(), "off");
+        let log = guarded.log();
         assert!(log.contains("pwmchip7/pwm0 is not at its shutdown value within 1000 ms:"), "{log}");
         // Two files are one output.
         assert!(log.contains("all 1 outputs are driven to their shutdown values"), "{log}");
@@ -436,35 +429,29 @@ mod tests {
 
     #[test]
     fn signals_that_ask_a_program_to_end_leave_the_guardian_alone() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("sleep", &file);
+        let mut guarded = Guarded::start("sleep");
         for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
-            kill(Pid::from_raw(guardian as i32), signal).unwrap();
+            kill(Pid::from_raw(guarded.guardian as i32), signal).unwrap();
         }
         thread::sleep(50 * MS);
-        assert!(!is_gone(guardian));
-        program.0.kill().unwrap();
-        wait_until("driven", || content(&file) == "off");
-        program.0.wait().unwrap();
+        assert!(!is_gone(guarded.guardian));
+        guarded.kill();
+        assert_eq!(guarded.output(), "off");
     }
 
     #[test]
     fn outputs_that_were_given_back_stay_as_they_are() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("release", &file);
-        program.0.kill().unwrap();
-        wait_until("the guardian ends", || is_gone(guardian));
-        assert_eq!(content(&file), "on ");
-        program.0.wait().unwrap();
+        let mut guarded = Guarded::start("release");
+        guarded.kill();
+        assert_eq!(guarded.output(), "on ");
     }
 
     #[test]
     fn after_a_goodbye_outputs_stay_as_they_are() {
-        let (_folder, file) = file();
-        let (mut program, guardian) = start("goodbye", &file);
-        assert!(program.0.wait().unwrap().success());
-        assert!(is_gone(guardian));
-        assert_eq!(content(&file), "on ");
+        let mut guarded = Guarded::start("goodbye");
+        assert!(guarded.program.wait().unwrap().success());
+        assert!(is_gone(guarded.guardian));
+        assert_eq!(guarded.output(), "on ");
     }
 
     #[test]

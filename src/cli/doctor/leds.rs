@@ -1,0 +1,226 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Whether LEDs on a data line of SPI, or on a fast line, get a clock that they understand.
+
+#![forbid(unsafe_code)]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use crate::cli::computer::Computer;
+use crate::cli::finding::Finding;
+use crate::cli::settings::BoardName;
+use pinion_linux::gpio::FastGpio;
+
+use super::devices::{FAST, is_pi, is_rp1, model, pi_config};
+use super::instance::Instance;
+
+/// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
+struct Vpu {
+    models: &'static [&'static str],
+    /// How the sections of config.txt begin that apply only to these models.
+    sections: &'static [&'static str],
+    core_freq: u32,
+    /// The value of `core_freq_min` if config.txt does not set it.
+    slowest: u32,
+    lines: &'static str,
+}
+
+const VPUS: [Vpu; 3] = [
+    Vpu {
+        models: &["Pi 4", "Module 4"],
+        sections: &["pi4", "cm4"],
+        core_freq: 500,
+        slowest: 200,
+        lines: "core_freq=500\\ncore_freq_min=500",
+    },
+    Vpu {
+        models: &["Pi 3", "Module 3"],
+        sections: &["pi3", "cm3"],
+        core_freq: 400,
+        slowest: 250,
+        lines: "core_freq=250",
+    },
+    Vpu { models: &["Pi Zero"], sections: &["pi0"], core_freq: 400, slowest: 250, lines: "core_freq=250" },
+];
+
+impl Vpu {
+    /// Whether config.txt keeps the clock from changing. Sections whose condition is not the model count.
+    fn is_held(&self, config: &str) -> bool {
+        let (mut core_freq, mut slowest, mut is_forced, mut applies) = (self.core_freq, self.slowest, false, true);
+        for line in config.lines().map(str::trim) {
+            if let Some(section) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
+                let is_model = ["pi", "cm"].iter().any(|model| section.starts_with(model));
+                let is_own = self.sections.iter().any(|own| section.starts_with(own));
+                applies = section != "none" && (!is_model || is_own);
+            }
+            let Some((key, value)) = line.split_once('=').filter(|_| applies) else { continue };
+            let Ok(value) = value.trim().parse() else { continue };
+            match key.trim() {
+                "core_freq" => core_freq = value,
+                "core_freq_min" => slowest = value,
+                "force_turbo" => is_forced = value == 1,
+                _ => {}
+            }
+        }
+        is_forced || slowest >= core_freq
+    }
+}
+
+/// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
+pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
+    const CHECK: &str = "leds";
+    let model = model(computer);
+    let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
+    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(computer)) else { return Vec::new() };
+    let Some(first) = pins.first() else { return Vec::new() };
+    let text = pi_config(computer).and_then(|config| Some((config, computer.text(config)?)));
+    let Some((config, text)) = text else { return Vec::new() };
+    let lines = vpu.lines;
+    let clock = match vpu.is_held(&text) {
+        true => Finding::ok(CHECK, format!("LEDs: {config} holds the clock of SPI")),
+        false => Finding::warning(
+            CHECK,
+            format!("LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"),
+            format!("printf '[all]\\n{lines}\\n' | sudo tee -a {config}, and reboot"),
+        ),
+    };
+    let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
+    let bus = without_dma.map(|pin| {
+        let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses amid a frame");
+        Finding::warning(CHECK, found, "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0")
+    });
+    [Some(clock), bus].into_iter().flatten().collect()
+}
+
+/// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
+pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(&Path, &str)>) -> Vec<Finding> {
+    let own = |link: &Path| {
+        let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
+        own.find(|instance| instance.link.as_deref() == Some(link))
+    };
+    let pins = pins.iter().filter_map(|(link, pin)| Some((own(link)?, pin)));
+    pins.map(|(instance, pin)| line_led(computer, instance, pin)).collect()
+}
+
+fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
+    const CHECK: &str = "leds";
+    let refused = |why: &str, remedy: String| Finding::error(CHECK, format!("LEDs: {pin} is refused: {why}"), remedy);
+    let set = |value: &str| format!("fast_gpio = \"{value}\" in {}, then {}", instance.config(), instance.restart());
+    const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
+    if is_rp1(computer) {
+        return refused("the RP1 is behind PCIe, which may shorten or join their pulses", TO_SPI.into());
+    }
+    let nodes = computer.matching(FAST.nodes);
+    let wish = instance.settings.fast_gpio;
+    if wish == FastGpio::Off && !nodes.is_empty() {
+        return refused("fast_gpio is off", set("auto"));
+    }
+    let Some(node) = nodes.first().filter(|_| wish != FastGpio::Off) else {
+        if wish == FastGpio::DevMem {
+            return Finding::ok(CHECK, format!("LEDs: {pin} is written through /dev/mem"));
+        }
+        return refused("this computer has no fast lines (no /dev/gpiomem)", TO_SPI.into());
+    };
+    let node = computer.name(node);
+    let mut about = fs::metadata(computer.path(&node)).ok().zip(instance.user(computer)).into_iter();
+    if let Some((_, user)) = about.find(|(about, user)| wish != FastGpio::DevMem && !user.may(FAST.access, about)) {
+        let why = format!("{} may not open {}", user.name, node.display());
+        return refused(&why, set("on") + ": pinion doctor then says what is missing");
+    }
+    Finding::ok(
+        CHECK,
+        format!("LEDs: {pin} is on a fast line, if it is one of the processor's own ({})", node.display()),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::instance::instances;
+    use super::super::tests::told;
+    use super::*;
+    use crate::cli::computer::tests::Tree;
+    use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
+
+    #[test]
+    fn leds_on_a_pi_need_a_clock_that_is_held() {
+        let judged = |model: &str, config: &str, pin: &str| {
+            let tree = Tree::new();
+            tree.put("proc/device-tree/model", model);
+            tree.put("boot/firmware/config.txt", config);
+            leds(&tree.computer(), &[pin].into())
+        };
+        for (model, held, loose, remedy) in [
+            (
+                "Raspberry Pi 4 Model B Rev 1.4\0",
+                &["core_freq=500\ncore_freq_min=500\n", "[pi4]\ncore_freq_min = 500\n", "force_turbo=1\n"][..],
+                &["", "core_freq=500\n", "[pi3]\ncore_freq_min=500\n", "#core_freq_min=500\n", "[none]\nforce_turbo=1"]
+                    [..],
+                "core_freq=500\\ncore_freq_min=500",
+            ),
+            (
+                "Raspberry Pi 3 Model B Plus Rev 1.3\0",
+                &["core_freq=250\n", "[pi3+]\ncore_freq=250\n", "[pi4]\n[all]\ncore_freq=250"][..],
+                &["", "core_freq=400\n", "[pi4]\ncore_freq=250\n"][..],
+                "core_freq=250",
+            ),
+            ("Raspberry Pi Zero 2 W Rev 1.0\0", &["core_freq=250\n"][..], &[""][..], "core_freq=250"),
+        ] {
+            for config in held {
+                told(
+                    &judged(model, config, "host:spidev0.0"),
+                    "leds",
+                    Fine,
+                    "/boot/firmware/config.txt holds the clock",
+                );
+            }
+            for config in loose {
+                let findings = judged(model, config, "host:spidev0.0");
+                assert!(
+                    told(&findings, "leds", Warning, "of host:spidev0.0 may be white").contains(remedy),
+                    "{config}"
+                );
+                assert_eq!(findings.len(), 1);
+            }
+        }
+        let findings = judged("Raspberry Pi 4", "force_turbo=1", "host:spidev1.0");
+        assert!(told(&findings, "leds", Warning, "of host:spidev1.0 has no DMA").contains("SPI0"));
+        assert!(judged("Raspberry Pi 5 Model B", "", "host:spidev0.0").is_empty(), "its SPI has a clock of its own");
+        assert!(judged("Raspberry Pi 2", "", "host:spidev0.0").is_empty(), "its VPU has one clock");
+        assert!(judged("Pine64", "", "host:spidev0.0").is_empty());
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4");
+        tree.put("boot/config.txt", "");
+        assert!(leds(&tree.computer(), &BTreeSet::new()).is_empty(), "there are no LEDs");
+    }
+
+    #[test]
+    fn leds_on_a_line_need_registers() {
+        let judged = |nodes: &[(&str, u32)], settings: &str, pin: &str| {
+            let tree = Tree::new();
+            tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
+            tree.put("etc/pinion/pinion.toml", settings);
+            nodes.iter().for_each(|(node, mode)| tree.put_mode(node, "", *mode));
+            let pins = [(Path::new("/tmp/klipper_host_mcu"), pin), (Path::new("/dev/board"), "PA1")];
+            line_leds(&tree.computer(), &instances(&tree.computer()).0, &pins.into())
+        };
+        let refused = |nodes: &[(&str, u32)], settings: &str, why: &str| {
+            let findings = judged(nodes, settings, "host:gpio18");
+            assert_eq!(findings.len(), 1, "{findings:?}");
+            told(&findings, "leds", Error, &format!("host:gpio18 is refused: {why}"))
+        };
+        let (pi_4, pi_5) = (("dev/gpiomem", 0o666), ("dev/gpiomem0", 0o666));
+        told(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
+        told(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
+        assert!(refused(&[], "", "this computer has no fast lines").contains("spidev0.0"));
+        assert!(refused(&[], "fast_gpio = \"off\"\n", "this computer has no fast lines").contains("spidev0.0"));
+        assert!(
+            refused(&[pi_4], "fast_gpio = \"off\"\n", "fast_gpio is off").contains("fast_gpio = \"auto\" in /etc/")
+        );
+        for settings in ["", "fast_gpio = \"on\"\n", "fast_gpio = \"off\"\n", "fast_gpio = \"/dev/mem\"\n"] {
+            assert!(refused(&[pi_5], settings, "the RP1 is behind PCIe").contains("spidev0.0"));
+        }
+        refused(&[("dev/gpiomem", 0o600)], "", "pinion may not open /dev/gpiomem");
+        assert!(judged(&[], "board = \"sim\"\n", "host:gpio18").is_empty(), "the simulated printer has any LEDs");
+    }
+}

@@ -1,0 +1,213 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! GPIO lines: which ones the pins of a printer.cfg mean, and which processes hold them.
+
+#![forbid(unsafe_code)]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use crate::cli::computer::Computer;
+use crate::cli::finding::Finding;
+use crate::cli::settings::BoardName;
+use pinion_linux::Inventory;
+use pinion_linux::gpio::Chip;
+use pinion_linux::pins::{Names, line_number};
+
+use super::devices::is_pi;
+use super::instance::Instance;
+use super::printer::line_of;
+
+/// The pins whose MCU is one of these instances, and has this computer's lines.
+pub(super) fn of_instances<'a>(instances: &[Instance], pins: &BTreeSet<(&Path, &'a str)>) -> BTreeSet<&'a str> {
+    let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
+    let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
+    pins.iter().filter(|(link, _)| links.contains(link)).map(|(_, pin)| *pin).collect()
+}
+
+/// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
+/// have numbered its chip differently.
+pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet<&str>) -> Vec<Finding> {
+    const CHECK: &str = "gpio_numbers";
+    let chips = &inventory.chips;
+    let Some(header) = inventory.header() else {
+        if !is_pi(computer) || chips.is_empty() {
+            return Vec::new();
+        }
+        let found = "this kernel has no driver for the lines of the 40-pin header";
+        return vec![Finding::warning(CHECK, found, "boot the kernel of Raspberry Pi OS")];
+    };
+    let names = Names::of(inventory);
+    let own_name = |offset: u32| {
+        let number = line_number(header.number, offset)?;
+        names.of_pin(number).first().map(|name| (*name).to_owned())
+    };
+    // The header has had these numbers. On a Pi 5 a chip of the processor may have them. Any other chip was connected on
+    // purpose.
+    let is_other = |number: u32| {
+        let chip = chips.iter().find(|chip| chip.number == number && [0, 4].contains(&number));
+        chip.is_some_and(|chip| chip.label.starts_with("gpio-brcmstb"))
+    };
+    let (mut former, mut other) = (Vec::new(), Vec::new());
+    for pin in pins {
+        let Some((chip, offset)) = line_of(pin) else { continue };
+        let Some(name) = own_name(offset) else { continue };
+        match () {
+            () if inventory.renumbered(chip).is_some() => former.push((*pin, name)),
+            () if is_other(chip) => other.push((*pin, name)),
+            () => {}
+        }
+    }
+    let write = |pins: &[(&str, String)]| {
+        let pins: Vec<String> = pins.iter().map(|(pin, name)| format!("{name} for {pin}")).collect();
+        format!("in printer.cfg write {}", pins.join(", "))
+    };
+    let shown = format!("gpiochip{} ({})", header.number, header.label);
+    let list = |pins: &[(&str, String)]| pins.iter().map(|(pin, _)| *pin).collect::<Vec<_>>().join(", ");
+    let mut findings = Vec::new();
+    if !former.is_empty() {
+        let found = format!(
+            "the header is {shown}, and the numbers in printer.cfg are those of another kernel: Pinion takes {} for its lines",
+            list(&former)
+        );
+        findings.push(Finding::warning(CHECK, found, write(&former)));
+    }
+    if !other.is_empty() {
+        let found = format!("the header is {shown}, and these pins are lines of another chip: {}", list(&other));
+        findings.push(Finding::warning(CHECK, found, write(&other) + ", if you mean lines of the header"));
+    }
+    if findings.is_empty() {
+        findings.push(Finding::ok(CHECK, format!("the 40-pin header is {shown}")));
+    }
+    findings
+}
+
+/// The holders of GPIO lines.
+pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
+    const CHECK: &str = "gpio_lines";
+    /// `pinion pins` lists more.
+    const SHOWN: usize = 8;
+    let chip = |chip: &Chip| {
+        let held = (0u32..).zip(&chip.lines).filter(|(_, line)| line.held);
+        let mut held: Vec<String> = held
+            .map(|(offset, line)| format!("{offset} by \"{}\"", line.consumer.as_deref().unwrap_or("the kernel")))
+            .collect();
+        let count = held.len();
+        held.truncate(SHOWN);
+        let more = if count > SHOWN { ", ... (pinion pins lists all)" } else { "" };
+        let colon = if count > 0 { ": " } else { "" };
+        let (number, label, lines) = (chip.number, &chip.label, chip.lines.len());
+        let list = held.join(", ");
+        Finding::ok(CHECK, format!("gpiochip{number} {label}: {count} of {lines} lines are held{colon}{list}{more}"))
+    };
+    let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
+    let programs: Vec<String> = computer
+        .all_processes()
+        .iter()
+        .filter(|process| {
+            let folder = computer.path(format!("/proc/{}/fd", process.pid));
+            let files = fs::read_dir(folder).into_iter().flatten().flatten();
+            let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
+            // The target is of one line, of several lines, or of a line with edges (drivers/gpio/gpiolib-cdev.c).
+            targets.any(|target| target.to_string_lossy().starts_with("anon_inode:gpio"))
+        })
+        .map(|process| {
+            let program = process.arguments.first().and_then(|program| program.file_name());
+            format!("{} (process {})", program.unwrap_or_default().to_string_lossy(), process.pid)
+        })
+        .collect();
+    if !programs.is_empty() {
+        findings.push(Finding::ok(CHECK, format!("programs that hold lines: {}", programs.join(", "))));
+    }
+    findings
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::instance::instances;
+    use super::super::tests::told;
+    use super::*;
+    use crate::cli::boards::{self, Board};
+    use crate::cli::computer::tests::Tree;
+    use crate::cli::finding::Level::{Ok as Fine, Warning};
+    use pinion_linux::gpio::LineInfo;
+
+    /// The findings about the header of a board, with these pins in printer.cfg.
+    fn about_header(board: &Board, pins: &[&str]) -> Vec<Finding> {
+        let tree = board.tree();
+        header(&tree.computer(), &board.inventory(&tree), &pins.iter().copied().collect())
+    }
+
+    #[test]
+    fn a_header_whose_chip_has_another_number() {
+        let numbered = ["gpio17", "gpiochip4/gpio33"];
+        let remedy = told(
+            &about_header(&boards::pi5(), &numbered),
+            "gpio_numbers",
+            Warning,
+            "the header is gpiochip15 (pinctrl-rp1), and the numbers in printer.cfg are those of another kernel: Pinion \
+             takes gpio17, gpiochip4/gpio33 for its lines",
+        );
+        assert_eq!(remedy, "in printer.cfg write GPIO17 for gpio17, pinctrl-rp1/gpio33 for gpiochip4/gpio33");
+        for pins in [&[][..], &["gpiochip15/gpio17"], &["gpiochip11/gpio1"], &["gpio99"]] {
+            let findings = about_header(&boards::pi5(), pins);
+            assert!(findings.len() == 1 && findings[0].told.remedy.is_none(), "{findings:?}");
+            told(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
+        }
+        // gpio17 is a line of the processor's own chip there.
+        let findings = about_header(&boards::pi5_debian(), &numbered);
+        let remedy = told(&findings, "gpio_numbers", Warning, "these pins are lines of another chip: gpio17");
+        assert_eq!(remedy, "in printer.cfg write pinctrl-rp1/gpio17 for gpio17, if you mean lines of the header");
+        assert_eq!(findings.len(), 1, "gpiochip4 is the header");
+        let findings = about_header(&boards::pi5_without_header(), &[]);
+        assert!(told(&findings, "gpio_numbers", Warning, "no driver for the lines").contains("Raspberry Pi OS"));
+        told(&about_header(&boards::pi4(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2711)");
+        told(&about_header(&boards::zero2(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2835)");
+        for board in [boards::cb1(), boards::rk3566()] {
+            assert_eq!(about_header(&board, &["gpio17"]), [], "it has no header of a Raspberry Pi");
+        }
+    }
+
+    /// Only pins of an MCU that has this computer's lines count.
+    #[test]
+    fn pins_of_another_micro_controller() {
+        let tree = Tree::new();
+        tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
+        let (host, board) = (Path::new("/tmp/klipper_host_mcu"), Path::new("/dev/board"));
+        let pins = || of_instances(&instances(&tree.computer()).0, &[(host, "gpio17"), (board, "gpio18")].into());
+        assert_eq!(pins(), ["gpio17"].into());
+        tree.put("etc/pinion/pinion.toml", "board = \"sim\"\n");
+        assert!(pins().is_empty());
+    }
+
+    #[test]
+    fn who_holds_which_line() {
+        let tree = Tree::new();
+        let line = |consumer: Option<&str>, held| LineInfo {
+            held,
+            consumer: consumer.map(str::to_owned),
+            ..LineInfo::default()
+        };
+        let chip = Chip {
+            number: 0,
+            label: "pinctrl".into(),
+            sleeps: false,
+            lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
+        };
+        let findings = holders(&tree.computer(), std::slice::from_ref(&chip));
+        told(
+            &findings,
+            "gpio_lines",
+            Fine,
+            "gpiochip0 pinctrl: 2 of 3 lines are held: 0 by \"spi0 CS0\", 2 by \"the kernel\"",
+        );
+        assert_eq!(findings.len(), 1);
+        tree.process(77, &["/usr/bin/gpiomon", "17"], 1000, &[]);
+        tree.link("proc/77/fd/3", "anon_inode:gpio-line");
+        tree.process(78, &["/usr/bin/other"], 1000, &[]);
+        tree.link("proc/78/fd/3", "/dev/null");
+        told(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
+        let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
+        told(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
+    }
+}
