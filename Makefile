@@ -171,9 +171,8 @@ check: system-packages-check
 	set -ex; '$(CARGO)' clippy --locked --workspace --all-targets $$small -- -D warnings --cfg fuzzing $$casts; \
 	export RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links'; \
 	'$(CARGO)' doc --locked --no-deps --document-private-items --quiet $$small
-	@# The program of the tests: one built for itself would have other features of some crates.
+	@# The programs of the tests: those built for themselves would have other features of some crates.
 	'$(CARGO)' test --locked --quiet --no-run
-	'$(CARGO)' build --locked --quiet --package pinion-simulator
 	CARGO='$(CARGO)' scripts/check-dependencies
 	scripts/check-man '$(CARGO_TARGET_DIR)/debug/pinion'
 	scripts/check-deb '$(CARGO_TARGET_DIR)/debug/pinion'

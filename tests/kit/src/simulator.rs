@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The program `pinion-sim`. `pinion` starts it from its own folder, and cargo builds only what is in the package of a
-//! test.
+//! The program `pinion-sim`. `pinion` starts it from its own folder, and for a test cargo builds only the programs of the
+//! test's package.
 
 use std::env;
 use std::path::{Path, PathBuf};
@@ -19,8 +19,9 @@ pub fn build_beside(pinion: &Path) -> &'static Path {
     BUILT.get_or_init(|| {
         let program = pinion.with_file_name("pinion-sim");
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
-        cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
-        cargo.args(["build", "--locked", "--quiet", "--package", "pinion-simulator"]);
+        cargo.current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
+        // As a part of all tests: with this package alone, its libraries would have other features, and be built again.
+        cargo.args(["test", "--locked", "--quiet", "--no-run", "--test", "pinion_sim"]);
         // TARGET/[TRIPLE/]PROFILE/pinion
         let folders: Vec<&str> = pinion.ancestors().skip(1).filter_map(|folder| folder.file_name()?.to_str()).collect();
         match folders[0] {
