@@ -8,6 +8,11 @@ use pinion_printer_config::{Limit, Section, Trouble};
 use super::description::Entry;
 use super::translate::Translator;
 
+/// How stiff a hot end on a load cell is.
+const CELL_G_PER_MM: f64 = 4000.0;
+/// The gain of a load cell without a calibration.
+const COUNTS_PER_GRAM: f64 = 400.0;
+
 impl Translator<'_> {
     pub(super) fn devices(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections() {
@@ -21,6 +26,7 @@ impl Translator<'_> {
             "probe" | "smart_effector" => self.probe(section),
             "bltouch" => self.bltouch(section),
             "probe_eddy_current" => self.eddy(section),
+            "load_cell" | "load_cell_probe" => self.load_cell(section),
             "filament_switch_sensor" => self.filament_switch(section),
             "filament_motion_sensor" => self.filament_motion(section),
             "servo" => self.servo(section),
@@ -76,7 +82,7 @@ impl Translator<'_> {
     }
 
     fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
-        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let bus = self.i2c(section)?;
         let address = section.whole("i2c_address", 0)?.unwrap_or(42);
         let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
         for axis in ["x", "y"] {
@@ -86,6 +92,36 @@ impl Translator<'_> {
         part = part.set_if("intb_pin", self.take(section, "intb_pin")?);
         let part = part.set("coil_mm", 2.5).set("far_hz", 3_100_000.0).set("near_hz", 300_000.0).set("fade_mm", 3.0);
         self.out.add("part", part.set("drive_current", 16));
+        Ok(())
+    }
+
+    fn load_cell(&mut self, section: &Section) -> Result<(), Trouble> {
+        let chip = section.required("sensor_type")?.to_owned();
+        let number = |key: &str, default: f64| section.number(key, Limit::Any).map(|n| n.unwrap_or(default));
+        let cell = Entry::default().set("stiffness_g_per_mm", CELL_G_PER_MM);
+        let cell = cell.set("counts_per_gram", number("counts_per_gram", COUNTS_PER_GRAM)?);
+        let cell = cell.set("zero_counts", number("reference_tare_counts", 0.0)?).0;
+        let part = match chip.as_str() {
+            "hx711" | "hx717" => {
+                let [dout, sclk] = ["dout_pin", "sclk_pin"].map(|key| self.take(section, key));
+                let (Some(dout), Some(sclk)) = (dout?, sclk?) else { return Ok(()) };
+                let rate = section.whole("sample_rate", 1)?.unwrap_or(if chip == "hx711" { 80 } else { 320 });
+                let part = Entry::default().set("kind", "hx71x").set("chip", chip).set("dout_pin", dout);
+                part.set("sclk_pin", sclk).set("samples_per_s", rate)
+            }
+            "ads1220" => {
+                section.required("cs_pin")?;
+                let (Some((bus, select)), Some(ready)) =
+                    (self.spi(section, "cs_pin")?, self.take(section, "data_ready_pin")?)
+                else {
+                    return Ok(());
+                };
+                let part = Entry::default().set("kind", "ads1220").set("bus", bus).set_if("select_pin", select);
+                part.set("drdy_pin", ready)
+            }
+            _ => return Ok(()),
+        };
+        self.out.add("part", part.set("cell", cell));
         Ok(())
     }
 
@@ -189,7 +225,7 @@ impl Translator<'_> {
             return Ok(());
         }
         if section.text("cs_pin").is_none() {
-            let Some(bus) = self.i2c(section)? else { return Ok(()) };
+            let bus = self.i2c(section)?;
             let name = self.name_of("part", section);
             let address = section.whole("i2c_address", 0)?.unwrap_or(60);
             let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
@@ -265,7 +301,7 @@ impl Translator<'_> {
             }
         };
         let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
-        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let bus = self.i2c(section)?;
         let name = self.name_of("part", section);
         let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
         self.out.add("part", part.set("address", address));
