@@ -245,7 +245,7 @@ pub const MISTAKES: &[Mistake] = &[
         "[tmc2209 stepper_y]",
         "[tmc2209 stepper_q]",
         "[tmc2209 stepper_q]",
-        "Could not find config section '[stepper_q]' required by TMC driver",
+        "Could not find config section '[stepper_q]' required by tmc driver",
     ),
     early(
         "[probe]\npin: ^tool:gpio9\nx_offset: 20\nz_offset: 1.5\n",

@@ -12,24 +12,25 @@ use pinion_printer_config::{Config, Section, Setting, Trouble};
 use super::known::{Kind, kind_of};
 
 /// How klippy looks an option's pin up.
-struct Role {
+#[derive(Clone, Copy)]
+struct Role<'a> {
     can_invert: bool,
     can_pull: bool,
     /// Others with the same word may have the pin, too.
-    share: Option<String>,
+    share: Option<&'a str>,
 }
 
-const PLAIN: Role = Role { can_invert: false, can_pull: false, share: None };
-const OUTPUT: Role = Role { can_invert: true, ..PLAIN };
-const INPUT: Role = Role { can_invert: true, can_pull: true, ..PLAIN };
+const PLAIN: Role<'static> = Role { can_invert: false, can_pull: false, share: None };
+const OUTPUT: Role<'static> = Role { can_invert: true, ..PLAIN };
+const INPUT: Role<'static> = Role { can_invert: true, can_pull: true, ..PLAIN };
 
-impl Role {
-    fn shared(self, share: &str) -> Role {
-        Role { share: Some(share.to_owned()), ..self }
+impl<'a> Role<'a> {
+    fn shared(self, share: &'a str) -> Role<'a> {
+        Role { share: Some(share), ..self }
     }
 
     /// The role of an option. `None` if klippy may leave the pin alone.
-    fn of(section: &Section, key: &str) -> Option<Role> {
+    fn of(section: &'a Section, key: &str) -> Option<Role<'a>> {
         let kind = section.kind();
         let is_extruder = kind.starts_with("extruder");
         let is_motor = is_extruder || kind.starts_with("stepper_") || kind == "manual_stepper";
@@ -48,7 +49,7 @@ impl Role {
             (_, "tachometer_pin") if is_fan => Role { can_pull: true, ..PLAIN },
             ("output_pin" | "pwm_tool" | "pwm_cycle_time" | "servo", "pin") => OUTPUT,
             ("static_digital_output", "pins") => OUTPUT,
-            ("led", _) => OUTPUT,
+            ("led", "red_pin" | "green_pin" | "blue_pin" | "white_pin") => OUTPUT,
             ("neopixel", "pin") | ("dotstar", "data_pin" | "clock_pin") => PLAIN,
             ("probe" | "smart_effector", "pin") | ("bltouch", "sensor_pin") => INPUT,
             ("bltouch", "control_pin") => OUTPUT,
@@ -106,7 +107,7 @@ pub(super) fn check(config: &Config, aliases: &Aliases, mcus: &[String]) -> Resu
             let Some(role) = Role::of(section, &setting.key) else { continue };
             let texts = setting.value.split(',').map(str::trim).filter(|text| !text.is_empty());
             for text in texts {
-                claims.claim(section, setting, text, &role)?;
+                claims.claim(section, setting, text, role)?;
             }
         }
     }
@@ -114,7 +115,7 @@ pub(super) fn check(config: &Config, aliases: &Aliases, mcus: &[String]) -> Resu
 }
 
 impl Claims<'_> {
-    fn claim(&mut self, section: &Section, setting: &Setting, text: &str, role: &Role) -> Result<(), Trouble> {
+    fn claim(&mut self, section: &Section, setting: &Setting, text: &str, role: Role<'_>) -> Result<(), Trouble> {
         let refused = |cause: String, remedy: &str| Err(section.trouble(&setting.key, cause).remedy(remedy));
         let pin = match Pin::parse(text, role.can_invert, role.can_pull) {
             Ok(pin) => pin,
@@ -129,7 +130,7 @@ impl Claims<'_> {
         }
         let place = (pin.chip.clone(), pin.name.clone());
         if let Some(known) = self.claims.get(&place).filter(|_| !self.free.contains(&place)) {
-            if role.share.is_none() || role.share != known.share {
+            if role.share.is_none() || role.share != known.share.as_deref() {
                 return refused(format!("pin {} used multiple times in config", pin.name), "name a pin of its own");
             }
             if (pin.inverted, pin.pull) != (known.pin.inverted, known.pin.pull) {
@@ -145,7 +146,7 @@ impl Claims<'_> {
         if *named != pin.name {
             return refused(format!("pin {} is an alias for {named}", pin.name), "name a pin of its own");
         }
-        self.claims.insert(place, Claim { pin, share: role.share.clone() });
+        self.claims.insert(place, Claim { pin, share: role.share.map(str::to_owned) });
         Ok(())
     }
 

@@ -27,7 +27,7 @@ impl Translator<'_> {
     fn driven(&mut self, section: &Section) -> Result<String, Trouble> {
         let stepper = section.name.split_once(' ').map_or("", |(_, stepper)| stepper).trim();
         self.axes.get(stepper).cloned().ok_or_else(|| {
-            let cause = format!("Could not find config section '[{stepper}]' required by TMC driver");
+            let cause = format!("Could not find config section '[{stepper}]' required by tmc driver");
             Trouble::new(cause).of(&section.place).remedy("add it, or remove the driver")
         })
     }

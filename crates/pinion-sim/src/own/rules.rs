@@ -288,7 +288,7 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
             return refused("points", cause.into(), "name the four corners");
         }
         // With other kinematics more motors move z.
-        "z_tilt" if ["cartesian", "corexy"].iter().any(|kind| kinematics == Some(kind)) => {
+        "z_tilt" if ["cartesian", "corexy"].iter().any(|kind| kinematics == Some(*kind)) => {
             let motors = 1 + (1..).take_while(|n| has(&format!("stepper_z{n}"))).count();
             if section.rows("z_positions")?.is_some_and(|places| places.len() != motors) {
                 let cause = format!("z_tilt z_positions needs exactly {motors} items");
