@@ -275,7 +275,8 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
                 return refused("color_order", format!("Invalid color_order '{order}'"), "write it as GRB");
             }
         }
-        "bed_mesh" if section.text("mesh_radius").is_none() => {
+        // [bed_mesh default] is a saved mesh.
+        "bed_mesh" if section.own_name().is_none() && section.text("mesh_radius").is_none() => {
             section.required("mesh_min")?;
             section.required("mesh_max")?;
             let (min, max) = (section.numbers("mesh_min")?, section.numbers("mesh_max")?);
