@@ -96,3 +96,24 @@ fn a_try_without_a_klippy_says_what_to_name() {
     assert_eq!(status, Some(1));
     assert!(log.contains("need a printer.cfg: name yours"), "{log}");
 }
+
+#[test]
+fn the_printer_of_another_file_stays_as_that_file_says() {
+    let (home, printer) = folder_with("printer.cfg", PRINTER);
+    let changed = home.path().join("new.cfg");
+    let board = |text: &str| {
+        fs::write(&changed, text).unwrap();
+        let like = printer.to_str().unwrap();
+        output(&["sim", changed.to_str().unwrap(), "--built-like", like, "--print-board"])
+    };
+    let text = PRINTER.replace("dir_pin: PB7", "dir_pin: !PB7").replace("pin: PA9", "pin: PA10");
+    let (status, printed, log) = board(&text);
+    assert_eq!(status, Some(0), "{log}");
+    assert!(printed.contains("dir_pin = \"PB7\"") && !printed.contains("!PB7"), "{printed}");
+    assert!(printed.contains("pin = \"PA9\""), "{printed}");
+    let free = printed.lines().find(|line| line.starts_with("pins = ") && line.contains("PA10"));
+    assert!(free.is_some(), "the changed file's pin exists, too: {printed}");
+    let (status, _, log) = board(&format!("{PRINTER}\n[mcu third]\nserial: /dev/third\n"));
+    assert_eq!(status, Some(1), "{log}");
+    assert!(log.contains("printer.cfg: it has the MCUs mcu, tool, and "), "{log}");
+}
