@@ -32,6 +32,11 @@ impl Translator<'_> {
         })
     }
 
+    /// The pin at which a driver says that its motor stalls. The level is the chip's: a `!` too many or too few shows.
+    fn take_diag(&mut self, section: &Section, key: &str) -> Result<Option<String>, Trouble> {
+        Ok(self.take(section, key)?.map(|pin| pin.trim_start_matches('!').to_owned()))
+    }
+
     fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
         let axis = self.driven(section)?;
         section.required("cs_pin")?;
@@ -58,7 +63,7 @@ impl Translator<'_> {
         }
         let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
         for key in diags {
-            part = part.set_if(key, self.take(section, key)?);
+            part = part.set_if(key, self.take_diag(section, key)?);
         }
         self.out.add("part", part);
         Ok(())
@@ -86,7 +91,7 @@ impl Translator<'_> {
         }
         if kind == "tmc2209" {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
-            part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
+            part = part.set_if("diag_pin", self.take_diag(section, "diag_pin")?);
             if let Some(threshold) = section.whole("driver_sgthrs", 0)? {
                 part = part.set("sg_free", Tmc2209Config::free_with_sgthrs(threshold.min(255) as u32));
             }
