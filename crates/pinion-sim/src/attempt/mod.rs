@@ -301,7 +301,13 @@ impl Trial<'_> {
 
     fn ready(&mut self) -> Outcome {
         if let Err(words) = self.until_ready() {
-            return self.failed(words, None);
+            let missing = self.own.config.sections().iter().find(|section| kind_of(section.kind()) != Kind::Known);
+            return match (self.failed(words, None), missing) {
+                (Outcome::Failed { cause, place }, Some(section)) => {
+                    Outcome::Failed { cause: format!("{cause} ([{}] is not simulated)", section.name), place }
+                }
+                (failed, _) => failed,
+            };
         }
         match self.host.objects() {
             Ok(objects) => self.objects = objects,

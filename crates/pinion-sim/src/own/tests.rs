@@ -47,6 +47,16 @@ fn motors_have_their_pins_their_steps_and_their_endstops() {
 }
 
 #[test]
+fn a_driver_pulls_its_stall_output_low_whatever_the_configuration_says() {
+    for text in ["^!PK1", "PK1"] {
+        let driver = format!("[tmc5160 stepper_x]\ncs_pin: PG4\ndiag1_pin: {text}\nrun_current: 1\ndriver_SGT: 3\n");
+        let Translated { description, .. } = translated(&format!("{PRINTER}{driver}")).unwrap();
+        let driver = named(&description, "part", "kind", "tmc5160");
+        assert_eq!((driver["diag1_pin"].as_str(), driver["sg_free"].as_integer()), (Some("PK1"), Some(170)));
+    }
+}
+
+#[test]
 fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     let text = format!("{PRINTER}[beacon]\nprobe_pin: PD1\n");
     let Translated { description, notes, .. } = translated(&text).unwrap();
