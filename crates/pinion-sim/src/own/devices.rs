@@ -30,9 +30,9 @@ impl Curve {
         };
         let mut points = saved.split(',').map(pair).collect::<Option<Vec<(f64, f64)>>>()?;
         points.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        let [first, middle, last] =
-            [points.first(), points.get(points.len().saturating_sub(1) / 2), points.last()].map(Option::copied);
-        let ((low_mm, at_low), (_, at_middle), (high_mm, at_high)) = (first?, middle?, last?);
+        let middle = points.len().saturating_sub(1) / 2;
+        let (&(low_mm, at_low), &(_, at_middle), &(high_mm, at_high)) =
+            (points.first()?, points.get(middle)?, points.last()?);
         let (near_part, far_part) = (at_low - at_middle, at_middle - at_high);
         if !(0.0 < far_part && far_part < near_part && low_mm < high_mm) {
             return None;
