@@ -5,17 +5,22 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+use pinion_testkit::mistakes::{MISTAKES, PRINTER};
 use serde_json::Value;
 
 use crate::checkout;
-use crate::klippy::{pinion_path, python};
+use crate::klippy::{batch, pinion_path, python};
 
 /// Tries a printer.cfg, and returns the results of its steps.
 fn tried(checkout: &Path, cfg: &Path, steps: &[&str]) -> (bool, Vec<Value>) {
-    let folder = tempfile::tempdir().unwrap();
+    tried_on(checkout, cfg, cfg, steps, tempfile::tempdir().unwrap().path())
+}
+
+/// The same on the printer of another printer.cfg, in a folder.
+fn tried_on(checkout: &Path, cfg: &Path, printer: &Path, steps: &[&str], folder: &Path) -> (bool, Vec<Value>) {
     let mut command = Command::new(pinion_path());
     command.args(["sim", "-r"]).arg(cfg).args(["--try", "--json", "--klipper"]).arg(checkout);
-    command.args(["--python", &python(), "--folder"]).arg(folder.path().join("sim"));
+    command.arg("--built-like").arg(printer).args(["--python", &python(), "--folder"]).arg(folder.join("sim"));
     steps.iter().for_each(|step| _ = command.args(["--only", step]));
     let done = command.output().unwrap();
     let log = String::from_utf8_lossy(&done.stderr);
@@ -65,5 +70,83 @@ fn a_mistake_fails_with_its_line() {
         assert!(failed["text"].as_str().unwrap().contains(words), "{failed}");
         let found = failed["line"].as_u64().unwrap() as usize;
         assert!(found.abs_diff(line + 1) <= 1, "{failed}: line {line}");
+    }
+}
+
+#[test]
+fn a_printer_of_two_boards_is_leveled_and_prints() {
+    let Some(checkout) = checkout("a_printer_of_two_boards_is_leveled_and_prints") else { return };
+    let home = tempfile::tempdir().unwrap();
+    let cfg = home.path().join("printer.cfg");
+    fs::write(&cfg, PRINTER).unwrap();
+    let (passed, steps) = tried_on(&checkout, &cfg, &cfg, &[], home.path());
+    assert!(passed, "{steps:?}");
+    let ended = |result: &str| -> Vec<&str> {
+        let steps = steps.iter().filter(|step| step["result"] == result);
+        steps.map(|step| step["step"].as_str().unwrap()).collect()
+    };
+    assert_eq!(ended("skipped"), ["carriage", "shaper"]);
+    let leveled = steps.iter().find(|step| step["step"] == "leveled").unwrap();
+    assert_eq!(leveled["text"], "Z_TILT_ADJUST, SCREWS_TILT_CALCULATE, BED_MESH_CALIBRATE");
+    for name in ["klippy.log", "picture.jpg", "path.svg"] {
+        assert!(fs::metadata(home.path().join("sim").join(name)).unwrap().len() > 1000, "{name}");
+    }
+}
+
+#[test]
+fn mistakes_have_klippys_own_words() {
+    let Some(checkout) = checkout("mistakes_have_klippys_own_words") else { return };
+    let dictionary = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dictionaries/klipper-master.json");
+    for mistake in MISTAKES.iter().filter(|mistake| mistake.is_early) {
+        let said = batch(&checkout, &dictionary, &mistake.text(), "").unwrap_err();
+        assert!(said.contains(mistake.words), "{mistake:?}: {said}");
+    }
+}
+
+#[test]
+fn every_configuration_of_a_printer_in_the_checkout_is_served() {
+    let Some(checkout) = checkout("every_configuration_of_a_printer_in_the_checkout_is_served") else { return };
+    let mut count = 0;
+    for file in fs::read_dir(checkout.join("config")).unwrap() {
+        let path = file.unwrap().path();
+        // The others are pieces.
+        if !fs::read_to_string(&path).is_ok_and(|text| text.contains("\n[printer]\n")) {
+            continue;
+        }
+        let done = Command::new(pinion_path()).arg("sim").arg(&path).arg("--print-board").output().unwrap();
+        assert!(done.status.success(), "{}: {}", path.display(), String::from_utf8_lossy(&done.stderr));
+        count += 1;
+    }
+    assert!(count > 150, "{count}");
+}
+
+/// Changes that klippy takes and that do not fit the printer: the step that fails, and a part of its text.
+const MISFITS: [(&str, &str, &str, &str); 8] = [
+    ("dir_pin: PB9", "dir_pin: !PB9", "homed", "No trigger on x after full movement"),
+    ("dir_pin: !PB5", "dir_pin: PB5", "homed", "No trigger on z after full movement"),
+    ("endstop_pin: ^PA5", "endstop_pin: ^!PA5", "homed", "Endstop x still triggered after retract"),
+    ("endstop_pin: ^PA5", "endstop_pin: ^PA4", "homed", "No trigger on x after full movement"),
+    ("position_endstop: 0\n", "position_endstop: 4\n", "homed", "the nozzle is"),
+    ("sensor_type: EPCOS 100K B57560G104F", "sensor_type: SliceEngineering 450", "heated", ""),
+    ("sensor_pin: PC5", "sensor_pin: PC6", "heated", ""),
+    ("rotation_distance: 40", "rotation_distance: 20", "printed", "mm off"),
+];
+
+#[test]
+fn a_change_that_does_not_fit_the_printer_fails() {
+    let Some(checkout) = checkout("a_change_that_does_not_fit_the_printer_fails") else { return };
+    let printer = checkout.join("config/printer-creality-ender3-v2-2020.cfg");
+    let text = fs::read_to_string(&printer).unwrap();
+    for (from, to, step, words) in MISFITS {
+        let changed = text.replacen(from, to, 1);
+        assert_ne!(changed, text, "{from}");
+        let home = tempfile::tempdir().unwrap();
+        let cfg = home.path().join("printer.cfg");
+        fs::write(&cfg, changed).unwrap();
+        let (_, steps) = tried_on(&checkout, &cfg, &printer, &["homed", step], home.path());
+        let failed =
+            steps.iter().find(|found| found["result"] == "failed").unwrap_or_else(|| panic!("{to}: {steps:?}"));
+        assert_eq!(failed["step"], step, "{to}: {failed}");
+        assert!(failed["text"].as_str().unwrap().contains(words), "{to}: {failed}");
     }
 }

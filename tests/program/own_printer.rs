@@ -3,6 +3,8 @@
 
 use std::fs;
 
+use pinion_testkit::mistakes::{MISTAKES, PRINTER};
+
 use crate::process::{Pinion, folder_with};
 
 /// Runs `pinion` to its end: its exit code, its output and its log.
@@ -11,48 +13,6 @@ fn output(args: &[&str]) -> (Option<i32>, String, String) {
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (done.status.code(), text(&done.stdout), text(&done.stderr))
 }
-
-/// A printer of two MCUs.
-const PRINTER: &str = "\
-[mcu]
-serial: /dev/serial/by-id/usb-a
-baud: 250000
-[mcu tool]
-canbus_uuid: 0123456789ab
-[printer]
-kinematics: cartesian
-max_velocity: 300
-max_accel: 3000
-[stepper_x]
-step_pin: PB9
-dir_pin: !PC2
-enable_pin: !PC3
-microsteps: 16
-rotation_distance: 40
-endstop_pin: ^tool:gpio5
-position_endstop: 0
-position_max: 235
-[stepper_y]
-step_pin: PB8
-dir_pin: PB7
-enable_pin: !PC3
-microsteps: 16
-rotation_distance: 40
-endstop_pin: ^PA6
-position_endstop: 0
-position_max: 235
-[stepper_z]
-step_pin: PB6
-dir_pin: !PB5
-enable_pin: !PC3
-microsteps: 16
-rotation_distance: 8
-endstop_pin: ^PA7
-position_endstop: 0
-position_max: 250
-[virtual_sdcard]
-path: ~/printer_data/gcodes
-";
 
 #[test]
 fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
@@ -75,7 +35,7 @@ fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
     assert_eq!(fs::read_to_string(&cfg).unwrap(), PRINTER, "the original");
     let client = pinion.client();
     let pins = format!("{:?}", client.dictionary());
-    for pin in ["PB9", "PC2", "PA6"] {
+    for pin in ["PB9", "PC2", "PA7"] {
         assert!(pins.contains(&format!("\"{pin}\"")), "{pin} is missing");
     }
     assert!(!pins.contains("gpio5"), "it is a pin of the other MCU");
@@ -86,26 +46,24 @@ fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
 }
 
 #[test]
-fn a_mistake_is_one_line_with_its_place() {
-    for (from, to, part) in [
-        (
-            "position_max: 235\n",
-            "",
-            "printer.cfg:10: Option 'position_max' in section 'stepper_x' must be specified: add it",
-        ),
-        (
-            "rotation_distance: 40",
-            "rotation_distance: -4",
-            "printer.cfg:15: Option 'rotation_distance' in section 'stepper_x' must be above 0.0",
-        ),
-        ("[printer]", "printer", "printer.cfg:6: Source contains parsing errors: 'printer'"),
-        ("[printer]", "[include printer.cfg]\n[printer]", "Recursive include of config file"),
-    ] {
-        let (_home, cfg) = folder_with("printer.cfg", &PRINTER.replacen(from, to, 1));
-        let (status, out, log) = output(&["sim", cfg.to_str().unwrap()]);
-        assert_eq!((status, out.as_str()), (Some(1), ""), "{log}");
-        assert!(log.contains(part), "{log}");
+fn a_mistake_is_one_line_with_its_place_in_klippys_words() {
+    for mistake in MISTAKES {
+        let (_home, cfg) = folder_with("printer.cfg", &mistake.text());
+        let (status, out, log) = output(&["sim", cfg.to_str().unwrap(), "--print-board"]);
+        assert_eq!((status, out.as_str()), (Some(1), ""), "{mistake:?}: {log}");
+        let place = format!("{}:{}: ", cfg.display(), mistake.line());
+        let said = log.lines().filter(|line| line.contains(&place)).collect::<Vec<&str>>();
+        assert!(said.len() == 1 && said[0].contains(mistake.words), "{mistake:?}: {place}: {log}");
+        assert!(said[0].split(mistake.words).nth(1).unwrap().contains(": "), "no remedy in {log}");
     }
+}
+
+#[test]
+fn files_that_include_each_other_are_refused() {
+    let (_home, cfg) = folder_with("printer.cfg", &PRINTER.replace("[printer]", "[include printer.cfg]\n[printer]"));
+    let (status, _, log) = output(&["sim", cfg.to_str().unwrap()]);
+    assert_eq!(status, Some(1));
+    assert!(log.contains("Recursive include of config file"), "{log}");
 }
 
 #[test]
@@ -137,4 +95,25 @@ fn a_try_without_a_klippy_says_what_to_name() {
     let (status, _, log) = output(&["sim", "--try"]);
     assert_eq!(status, Some(1));
     assert!(log.contains("need a printer.cfg: name yours"), "{log}");
+}
+
+#[test]
+fn the_printer_of_another_file_stays_as_that_file_says() {
+    let (home, printer) = folder_with("printer.cfg", PRINTER);
+    let changed = home.path().join("new.cfg");
+    let board = |text: &str| {
+        fs::write(&changed, text).unwrap();
+        let like = printer.to_str().unwrap();
+        output(&["sim", changed.to_str().unwrap(), "--built-like", like, "--print-board"])
+    };
+    let text = PRINTER.replace("dir_pin: PB7", "dir_pin: !PB7").replace("pin: PA9", "pin: PA10");
+    let (status, printed, log) = board(&text);
+    assert_eq!(status, Some(0), "{log}");
+    assert!(printed.contains("dir_pin = \"PB7\"") && !printed.contains("!PB7"), "{printed}");
+    assert!(printed.contains("pin = \"PA9\""), "{printed}");
+    let free = printed.lines().find(|line| line.starts_with("pins = ") && line.contains("PA10"));
+    assert!(free.is_some(), "the changed file's pin exists, too: {printed}");
+    let (status, _, log) = board(&format!("{PRINTER}\n[mcu third]\nserial: /dev/third\n"));
+    assert_eq!(status, Some(1), "{log}");
+    assert!(log.contains("printer.cfg: it has the MCUs mcu, tool, and "), "{log}");
 }

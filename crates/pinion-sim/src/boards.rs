@@ -15,7 +15,6 @@ use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
 use pinion_runtime::{Helpers, LinkName, Options, Recording};
 use pinion_sim::{SimBoard, SimConfig};
-use pinion_trace::folder::folders;
 
 /// How long all boards have to open their links.
 const START: Duration = Duration::from_secs(10);
@@ -38,14 +37,20 @@ pub(crate) fn links_of<'a>(first: &Path, names: impl Iterator<Item = &'a str>) -
 /// The helper processes of a board, which start before the program has threads.
 pub(crate) type Started = (PathBuf, Recording, Helpers);
 
-/// Starts the helper processes of each board. Call it before any thread starts.
+/// Starts the helper processes of each board. Recordings of stops go into the first of these folders that takes them. Call
+/// it before any thread starts.
 ///
 /// # Errors
 ///
 /// There are threads already, or the kernel has no room.
-pub(crate) fn start(links: &[PathBuf], clock: Monotonic, realtime: bool) -> Result<Vec<Started>, Trouble> {
+pub(crate) fn start(
+    links: &[PathBuf],
+    clock: Monotonic,
+    realtime: bool,
+    folders: &[PathBuf],
+) -> Result<Vec<Started>, Trouble> {
     let start = |link: &PathBuf| {
-        let recording = Recording::new(clock, link, realtime, folders())?;
+        let recording = Recording::new(clock, link, realtime, folders.to_vec())?;
         let helpers = Helpers::start(&recording, false, true, sys::SERVE)?;
         Ok((link.clone(), recording, helpers))
     };

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use pinion_camera::scene::{
     Axis, Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Printer, Probe, Rgb, Scene, Servo, Strip,
 };
+use pinion_camera::{Layout, Picture};
 use pinion_firmware::time::CLOCK_FREQ;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
@@ -49,31 +50,59 @@ pub(crate) fn parse(text: &str) -> Result<String, String> {
     }
 }
 
+/// Facts about a printer that never change.
+struct Subject {
+    gantry: Gantry,
+    probes: Vec<Probe>,
+}
+
+impl Subject {
+    fn new(config: &SimConfig) -> Subject {
+        let gantry = match &config.delta {
+            Some(delta) => Gantry::Delta { towers_mm: delta.towers_mm(), arm_mm: delta.arm_mm },
+            None if config.corexy => Gantry::CoreXy,
+            None => Gantry::Cartesian,
+        };
+        Subject { gantry, probes: config.parts.iter().filter_map(probe).collect() }
+    }
+}
+
+fn printer(gantry: Gantry, sim: &SimProbe) -> Printer {
+    let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
+    Printer { bed: shape(bed), height_mm, gantry }
+}
+
+/// A JPEG of the printer now, with the filament that this recorder saw. `None` without memory for it.
+pub(crate) fn picture(config: &SimConfig, sim: &SimProbe, recorder: Recorder) -> Option<Vec<u8>> {
+    let Subject { gantry, probes } = Subject::new(config);
+    let laid = Arc::new(Mutex::new(Vec::new()));
+    Filament { recorder, ..Filament::new(sim.clone(), laid.clone()) }.read();
+    let laid = std::mem::take(&mut *laid.lock().unwrap_or_else(PoisonError::into_inner));
+    let mut picture = Picture::new(printer(gantry, sim))?;
+    let scene = Scene { laid, ..scene(sim, &probes, &Targets::default()) };
+    picture.take(&scene);
+    picture.draw(&scene, Layout::Wide);
+    Some(picture.jpeg(Layout::Wide))
+}
+
 /// A camera that nobody can look through yet.
 pub(crate) struct Camera {
     listener: TcpListener,
-    gantry: Gantry,
-    probes: Vec<Probe>,
+    subject: Subject,
 }
 
 impl Camera {
     /// Takes the address, and what never changes about the printer.
     pub(crate) fn open(address: &str, config: &SimConfig) -> Result<Camera, Trouble> {
         let listener = bind(address).map_err(|trouble| trouble.of(format_args!("--camera {address}")))?;
-        let gantry = match &config.delta {
-            Some(delta) => Gantry::Delta { towers_mm: delta.towers_mm(), arm_mm: delta.arm_mm },
-            None if config.corexy => Gantry::CoreXy,
-            None => Gantry::Cartesian,
-        };
-        Ok(Camera { listener, gantry, probes: config.parts.iter().filter_map(probe).collect() })
+        Ok(Camera { listener, subject: Subject::new(config) })
     }
 
     /// Serves the picture from now on, and says where. Call it before this thread runs in real time: the camera's
     /// threads get its scheduling.
     pub(crate) fn start(self, sim: SimProbe, own: OwnStatus) -> Result<(), Trouble> {
-        let Camera { listener, gantry, probes } = self;
-        let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
-        let printer = Printer { bed: shape(bed), height_mm, gantry };
+        let Camera { listener, subject: Subject { gantry, probes } } = self;
+        let printer = printer(gantry, &sim);
         let address = listener.local_addr().map_err(|error| Trouble::new(error.to_string()).of("--camera"))?;
         let thread = thread::Builder::new().name("camera".into()).spawn(move || {
             if let Err(error) = sys::set_nice(NICE) {

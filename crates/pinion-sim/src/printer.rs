@@ -38,6 +38,7 @@ use crate::toolpath::{Files, PathArgs, PathRecord};
 use pinion::cli::files::Output;
 use pinion::cli::page::{Page, print};
 use pinion::cli::{end, failed, logging};
+use pinion_trace::folder::folders;
 
 /// Options of `pinion-sim`.
 #[derive(Args, Clone, Debug)]
@@ -110,7 +111,9 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
             Err(error) => return failed(error),
         },
         None if args.own.is_used() => {
-            return failed("--try, --with, --folder and --in-place-pty need a printer.cfg: name yours before them");
+            return failed(
+                "--try, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
+            );
         }
         None => None,
     };
@@ -143,7 +146,11 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     };
     let symlink = links[0].clone();
     let clock = Monotonic::start();
-    let mut started = match boards::start(&links, clock, args.realtime) {
+    let folders = match owner.as_ref().map(|owner| &owner.place) {
+        Some(Place::Folder(folder)) => vec![folder.path.clone()],
+        _ => folders(),
+    };
+    let mut started = match boards::start(&links, clock, args.realtime, &folders) {
         Ok(started) => started,
         Err(error) => return failed(error),
     };

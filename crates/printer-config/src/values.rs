@@ -16,6 +16,10 @@ pub enum Limit {
     Min(f64),
     /// `above` of klippy.
     Above(f64),
+    /// `above` and `maxval` of klippy.
+    AboveTo(f64, f64),
+    /// `minval` and `maxval` of klippy.
+    Between(f64, f64),
 }
 
 impl Section {
@@ -76,14 +80,21 @@ impl Section {
     }
 
     fn bounded(&self, key: &str, value: f64, limit: Limit) -> Result<(), Trouble> {
-        let (is_right, rule, bound) = match limit {
-            Limit::Any => return Ok(()),
-            Limit::Min(min) => (value >= min, "have minimum of", min),
-            Limit::Above(above) => (value > above, "be above", above),
+        let (min, above, max) = match limit {
+            Limit::Any => (None, None, None),
+            Limit::Min(min) => (Some(min), None, None),
+            Limit::Above(above) => (None, Some(above), None),
+            Limit::AboveTo(above, max) => (None, Some(above), Some(max)),
+            Limit::Between(min, max) => (Some(min), None, Some(max)),
         };
-        if is_right {
+        let broken = [
+            (min.filter(|min| value < *min), "have minimum of"),
+            (max.filter(|max| value > *max), "have maximum of"),
+            (above.filter(|above| value <= *above), "be above"),
+        ];
+        let Some((bound, rule)) = broken.into_iter().find_map(|(bound, rule)| Some((bound?, rule))) else {
             return Ok(());
-        }
+        };
         let cause = format!("Option '{key}' in section '{}' must {rule} {bound:?}", self.name);
         Err(self.trouble(key, cause).remedy("correct its value"))
     }

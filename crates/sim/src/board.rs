@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use pinion_firmware::board::{
@@ -83,6 +84,7 @@ impl SimWorld {
         let printer = config.printer();
         let now = clock.now();
         let mut workshop = Workshop {
+            levels: Vec::new(),
             printer,
             clock: clock.clone(),
             world: World::default(),
@@ -164,21 +166,23 @@ impl SimWorld {
         for part in &config.parts {
             part.part().build(&mut workshop)?;
         }
+        // Buses may share lines.
+        let mut lines: BTreeMap<&str, (&PinName, &str)> = BTreeMap::new();
         for bus in &config.spi_buses {
-            let line = |kind| ControllerPin { kind, of: bus.name.clone() };
             match bus.lines() {
-                None => workshop.wire(Some(&bus.output_pin()), line(Kind::Mosi)),
-                Some([miso, mosi, sclk]) => {
-                    workshop.wire(Some(miso), line(Kind::Free));
-                    workshop.wire(Some(mosi).filter(|mosi| mosi.name != miso.name), line(Kind::Free));
-                    workshop.wire(Some(sclk), line(Kind::Free));
+                None => {
+                    let pin = ControllerPin { kind: Kind::Mosi, of: bus.name.clone() };
+                    workshop.wire(Some(&bus.output_pin()), pin);
                 }
+                Some(of_bus) => lines.extend(of_bus.map(|pin| (pin.name.as_str(), (pin, bus.name.as_str())))),
             }
         }
         for bus in &config.i2c_buses {
-            for pin in bus.lines().into_iter().flatten() {
-                workshop.wire(Some(pin), ControllerPin { kind: Kind::Free, of: bus.name.clone() });
-            }
+            let of_bus = bus.lines().into_iter().flatten();
+            lines.extend(of_bus.map(|pin| (pin.name.as_str(), (pin, bus.name.as_str()))));
+        }
+        for (pin, bus) in lines.into_values() {
+            workshop.wire(Some(pin), ControllerPin { kind: Kind::Free, of: bus.to_owned() });
         }
         for pin in config.mcus.iter().map(McuConfig::free_pins) {
             pin?.iter().for_each(|pin| workshop.wire(Some(pin), FreePin));

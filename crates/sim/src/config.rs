@@ -188,12 +188,15 @@ impl SimConfig {
         }
         part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
         part.uart_pins().into_iter().try_for_each(|(key, pin)| pins.claim_for(Some("UART"), whose, key, pin))?;
+        for pin in part.select_pins() {
+            pins.claim_for(Some("select line"), whose, "select_pins", Some(pin))?;
+        }
         let socket = part.socket();
         let neighbours = self.parts.iter().map(PartConfig::part).filter(|other| other.name() != part.name());
         let mut neighbours = neighbours.filter_map(Part::socket);
         match socket {
             Some(Socket::Spi { bus, select_pin }) => {
-                pins.claim(whose, "select_pin", select_pin)?;
+                pins.claim_for(part.chain().map(|_| "chain"), whose, "select_pin", select_pin)?;
                 printer.check_spi_bus(whose, bus)?;
                 if select_pin.is_some_and(|pin| pin.inverted) {
                     let cause = "klippy knows chips that are selected by a low level only";

@@ -9,6 +9,7 @@
 //! - [`names`]: names that others chose, for property tests
 //! - [`simulator`]: the program `pinion-sim`
 //! - [`markdown`]: the pages for users, and the blocks in them
+//! - [`mistakes`]: a printer.cfg, and mistakes in it
 
 #![forbid(unsafe_code)]
 
@@ -23,6 +24,7 @@ pub mod here;
 pub mod initramfs;
 pub mod kernel;
 pub mod markdown;
+pub mod mistakes;
 pub mod names;
 pub mod process;
 pub mod simulator;

@@ -93,11 +93,7 @@ impl Host {
             if ended.is_some() || Instant::now() > until {
                 let _ = child.kill();
                 let _ = child.wait();
-                let log = folder.path.join("klippy.out");
-                let said = std::fs::read_to_string(&log).unwrap_or_default();
-                let last = said.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or_default().to_owned();
-                let trouble = failed(format!("klippy does not start: {last}"));
-                return Err(trouble.remedy(format!("read {}, and name its Python with --python", log.display())));
+                return Err(no_start(&folder.path, ended.is_some()).of(program.display()));
             }
             thread::sleep(Duration::from_millis(50));
         };
@@ -223,6 +219,29 @@ impl Host {
     }
 }
 
+/// The reason why klippy opened no API, in its last words, and what helps.
+fn no_start(folder: &Path, ended: bool) -> Trouble {
+    let last_of = |name: &str| {
+        let said = std::fs::read_to_string(folder.join(name)).unwrap_or_default();
+        said.lines().rev().find(|line| !line.trim().is_empty()).map(str::to_owned)
+    };
+    if !ended {
+        let cause = format!("klippy opens no API within {} s", START.as_secs());
+        return Trouble::new(cause).remedy(format!("read {}", folder.join("klippy.log").display()));
+    }
+    let (file, last) = match (last_of("klippy.out"), last_of("klippy.log")) {
+        (Some(last), _) => ("klippy.out", last),
+        (None, last) => ("klippy.log", last.unwrap_or_else(|| "it says nothing".into())),
+    };
+    let file = folder.join(file);
+    let remedy = if ["ModuleNotFoundError", "ImportError"].iter().any(|error| last.starts_with(error)) {
+        format!("install klippy's requirements, or name its Python with --python; {} has more", file.display())
+    } else {
+        format!("read {}", file.display())
+    };
+    Trouble::new(format!("klippy does not start: {last}")).remedy(remedy)
+}
+
 impl Host {
     /// Ends klippy. One that hangs is killed.
     pub(super) fn end(&mut self) {
@@ -243,5 +262,26 @@ impl Host {
 impl Drop for Host {
     fn drop(&mut self) {
         self.end();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_klippy_that_does_not_start_is_explained_by_its_last_words() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        let reason = |ended| no_start(folder.path(), ended).to_string().replace(folder.path().to_str().unwrap(), "F");
+        assert_eq!(reason(false), "klippy opens no API within 60 s: read F/klippy.log");
+        assert_eq!(reason(true), "klippy does not start: it says nothing: read F/klippy.log");
+        said("klippy.log", "Starting Klippy...\n");
+        said("klippy.out", "Traceback\nModuleNotFoundError: No module named 'greenlet'\n");
+        let text = reason(true);
+        assert!(text.starts_with("klippy does not start: ModuleNotFoundError: No module named 'greenlet'"), "{text}");
+        assert!(text.contains("--python"), "{text}");
+        said("klippy.out", "Traceback\nOSError: cannot find chelper.so\n");
+        assert_eq!(reason(true), "klippy does not start: OSError: cannot find chelper.so: read F/klippy.out");
     }
 }

@@ -11,7 +11,8 @@ mod place;
 mod report;
 mod small;
 
-use std::io::BufReader;
+use std::fs;
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -20,11 +21,13 @@ use std::time::{Duration, Instant};
 
 use pinion::cli::files;
 use pinion_firmware::time::{Clock, Ticks};
-use pinion_printer_config::{Limit, Place, Trouble};
-use pinion_sim::{AskedPath, SimProbe, compare};
+use pinion_printer_config::{Limit, Place, Section, Trouble};
+use pinion_sim::{AskedPath, Recorder, SimProbe, compare, write_svg};
 use serde_json::Value;
 
+use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
+use crate::own::{Kind, kind_of};
 use host::{Host, Refused};
 use place::place_of;
 use report::{Form, Outcome, Report};
@@ -45,6 +48,18 @@ const NEAR_K: f64 = 4.0;
 const NEAR_MM: f64 = 0.15;
 /// Distance above which a print is wrong.
 const WITHIN_MM: f64 = 0.1;
+/// How level a gantry or bed has to be.
+const LEVEL_MM: f64 = 0.1;
+/// The sections that level something with a probe, in the order in which an owner uses them, and their commands.
+const LEVELS: [(&str, &str); 7] = [
+    ("bed_tilt", "BED_TILT_CALIBRATE"),
+    ("z_tilt", "Z_TILT_ADJUST"),
+    ("z_tilt_ng", "Z_TILT_ADJUST"),
+    ("quad_gantry_level", "QUAD_GANTRY_LEVEL"),
+    ("delta_calibrate", "DELTA_CALIBRATE"),
+    ("screws_tilt_adjust", "SCREWS_TILT_CALCULATE"),
+    ("bed_mesh", "BED_MESH_CALIBRATE"),
+];
 /// Longest G-code file.
 const GCODE_MIB: u64 = 256;
 /// Names of macros that begin and end a print.
@@ -96,7 +111,7 @@ pub(crate) fn run(
             return false;
         }
     };
-    let mut trial = Trial { attempt, folder, own, probe, host, objects: Vec::new(), broken: None };
+    let mut trial = Trial { attempt, folder, own, probe, host, objects: Vec::new(), path: None, broken: None };
     for step in STEPS {
         if ended.load(Ordering::SeqCst) {
             break;
@@ -115,6 +130,9 @@ pub(crate) fn run(
         }
         report.add(step.name, outcome, since);
     }
+    if let Err(trouble) = trial.keep() {
+        log::warn!("{trouble}");
+    }
     drop(trial);
     report.end(printer, &folder.path);
     report.passed() && !ended.load(Ordering::SeqCst)
@@ -129,19 +147,23 @@ struct Step {
 const STEPS: &[Step] = &[
     Step { name: "ready", run: |trial| trial.ready() },
     Step { name: "homed", run: |trial| trial.homed() },
+    Step { name: "carriage", run: |trial| trial.second_carriage() },
     Step { name: "heated", run: |trial| trial.heated() },
     Step { name: "fans", run: |trial| trial.fans() },
     Step { name: "lights", run: |trial| trial.lights() },
     Step { name: "servo", run: |trial| trial.servo() },
-    Step { name: "z_tilt", run: |trial| trial.leveled("z_tilt", "Z_TILT_ADJUST") },
-    Step { name: "gantry", run: |trial| trial.leveled("quad_gantry_level", "QUAD_GANTRY_LEVEL") },
-    Step { name: "bed_mesh", run: |trial| trial.leveled("bed_mesh", "BED_MESH_CALIBRATE") },
+    Step { name: "leveled", run: |trial| trial.leveled() },
     Step { name: "probe", run: |trial| trial.probed() },
     Step { name: "shaper", run: |trial| trial.shaped() },
     Step { name: "macros", run: |trial| trial.macros() },
     Step { name: "printed", run: |trial| trial.printed() },
     Step { name: "cooled", run: |trial| trial.cooled() },
 ];
+
+/// Whether a section's command moves the motors of z apart.
+fn levels_motors(section: &Section) -> bool {
+    ["z_tilt", "z_tilt_ng", "quad_gantry_level"].contains(&section.name.as_str())
+}
 
 /// Whether a step comes before anything is homed.
 fn is_first(step: &str) -> bool {
@@ -155,11 +177,33 @@ struct Trial<'a> {
     probe: &'a SimProbe,
     host: Host,
     objects: Vec<String>,
+    /// The path of the print.
+    path: Option<Recorder>,
     /// Why nothing more can be tried.
     broken: Option<String>,
 }
 
 impl Trial<'_> {
+    /// Writes the camera's picture, and the path of the print, into the folder.
+    fn keep(&mut self) -> Result<(), Trouble> {
+        let place = |name| self.folder.path.join(name);
+        let failed = |path: PathBuf, error: io::Error| {
+            Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("free space")
+        };
+        if let Some(path) = &self.path {
+            let file = place("path.svg");
+            let mut drawing = Vec::new();
+            let drawn = write_svg(path.points(), path.filament_step_mm(), &mut drawing);
+            drawn.and_then(|()| fs::write(&file, drawing)).map_err(|error| failed(file, error))?;
+        }
+        let path = self.path.take().unwrap_or_else(|| self.probe.recorder());
+        if let Some(jpeg) = picture(&self.own.sim, self.probe, path) {
+            let file = place("picture.jpg");
+            fs::write(&file, jpeg).map_err(|error| failed(file, error))?;
+        }
+        Ok(())
+    }
+
     fn failed(&self, cause: impl Into<String>, place: Option<Place>) -> Outcome {
         let cause = cause.into();
         let place = place.or_else(|| place_of(&self.own.config, &cause));
@@ -257,7 +301,13 @@ impl Trial<'_> {
 
     fn ready(&mut self) -> Outcome {
         if let Err(words) = self.until_ready() {
-            return self.failed(words, None);
+            let missing = self.own.config.sections().iter().find(|section| kind_of(section.kind()) != Kind::Known);
+            return match (self.failed(words, None), missing) {
+                (Outcome::Failed { cause, place }, Some(section)) => {
+                    Outcome::Failed { cause: format!("{cause} ([{}] is not simulated)", section.name), place }
+                }
+                (failed, _) => failed,
+            };
         }
         match self.host.objects() {
             Ok(objects) => self.objects = objects,
@@ -331,6 +381,36 @@ impl Trial<'_> {
             return self.failed(format!("after G28 the nozzle is {off:.3} mm from klippy's {axis} position"), place);
         }
         Outcome::Passed(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
+    }
+
+    /// Moves the second carriage of a printer with two, and looks where its motor is.
+    fn second_carriage(&mut self) -> Outcome {
+        let Some(section) = self.own.config.section("dual_carriage") else {
+            return Outcome::Skipped("there is no [dual_carriage]".into());
+        };
+        let before = self.lost();
+        for command in ["G28", "SET_DUAL_CARRIAGE CARRIAGE=1"] {
+            if let Err(outcome) = self.gcode(command, LONG) {
+                return outcome.at(&section.place);
+            }
+        }
+        let Ok(status) = self.host.query(&["toolhead"]) else { return self.failed("klippy does not answer", None) };
+        let axis = usize::from(section.text("axis") == Some("y"));
+        let [low, high] = ["axis_minimum", "axis_maximum"].map(|key| coordinates(&status["toolhead"][key])[axis]);
+        let (middle, letter) = ((low + high) / 2.0, ["X", "Y"][axis]);
+        let moves = format!("G90\nG1 {letter}{middle:.2} F6000\nM400");
+        if let Err(outcome) = self.gcode(&moves, LONG) {
+            return outcome.at(&section.place);
+        }
+        let off = self.probe.axis("dual_carriage").map(|axis| (axis.position_mm - middle).abs());
+        if let Some(off) = off.filter(|off| *off > NEAR_MM) {
+            let cause = format!("the second carriage is {off:.3} mm from klippy's {letter} position");
+            return self.failed(cause, Some(section.place_of("position_endstop").clone()));
+        }
+        if let Err(outcome) = self.gcode("SET_DUAL_CARRIAGE CARRIAGE=0", LONG) {
+            return outcome.at(&section.place);
+        }
+        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(format!("the second carriage is at {middle:.2}")))
     }
 
     fn kinematics(&self) -> Option<&str> {
@@ -508,18 +588,36 @@ impl Trial<'_> {
         Outcome::Passed(names.join(", "))
     }
 
-    fn leveled(&mut self, object: &str, command: &str) -> Outcome {
-        if !self.has(object) {
-            return Outcome::Skipped(format!("there is no [{object}]"));
+    fn leveled(&mut self) -> Outcome {
+        let config = &self.own.config;
+        let found: Vec<_> =
+            LEVELS.iter().filter_map(|(name, command)| Some((config.section(name)?, *command))).collect();
+        if found.is_empty() {
+            return Outcome::Skipped("nothing of [z_tilt], [quad_gantry_level], [bed_mesh] is there".into());
         }
-        if object == "bed_mesh" && !self.has("probe") {
+        if !self.has("probe") {
             return Outcome::Skipped("there is no probe".into());
         }
         let before = self.lost();
-        if let Err(outcome) = self.gcode("G28", LONG).and_then(|()| self.gcode(command, LONG)) {
-            return outcome;
+        for (section, command) in &found {
+            if let Err(outcome) = self.gcode("G28", LONG).and_then(|()| self.gcode(command, LONG)) {
+                return outcome.at(&section.place);
+            }
+            if let Some((apart, name)) = self.apart().filter(|(apart, _)| *apart > LEVEL_MM && levels_motors(section)) {
+                let cause = format!("after {command} the motor {name} holds its side {apart:.3} mm too high or low");
+                return self.failed(cause, Some(section.place.clone()));
+            }
         }
-        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(command.into()))
+        let commands: Vec<&str> = found.iter().map(|(_, command)| *command).collect();
+        self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(commands.join(", ")))
+    }
+
+    /// The largest distance of a z motor from the first one, and its name. The simulated bed is flat.
+    fn apart(&self) -> Option<(f64, String)> {
+        let first = self.probe.axis("z")?.position_mm;
+        let others = (1..).map_while(|n| self.probe.axis(&format!("z{n}")));
+        let apart = others.map(|axis| ((axis.position_mm - first).abs(), axis.name.to_owned()));
+        apart.max_by(|(a, _), (b, _)| a.total_cmp(b))
     }
 
     fn probed(&mut self) -> Outcome {
@@ -537,12 +635,19 @@ impl Trial<'_> {
     }
 
     fn shaped(&mut self) -> Outcome {
-        if !self.has("resonance_tester") && self.own.config.section("resonance_tester").is_none() {
+        let Some(section) = self.own.config.section("resonance_tester") else {
             return Outcome::Skipped("there is no [resonance_tester]".into());
+        };
+        let chips = ["accel_chip", "accel_chip_x", "accel_chip_y"].into_iter().filter_map(|key| section.text(key));
+        let kinds = chips.filter_map(|chip| chip.split_whitespace().next());
+        if let Some(kind) = kinds.into_iter().find(|kind| kind_of(kind) != Kind::Known) {
+            return Outcome::Skipped(format!("[{kind}] is not simulated"));
         }
-        match self.gcode("SHAPER_CALIBRATE", LONG) {
+        // The whole range would take four minutes.
+        let calibrate = "SHAPER_CALIBRATE FREQ_START=25 FREQ_END=85 HZ_PER_SEC=2";
+        match self.gcode("G28", LONG).and_then(|()| self.gcode(calibrate, LONG)) {
             Ok(()) => Outcome::Passed("SHAPER_CALIBRATE".into()),
-            Err(outcome) => outcome,
+            Err(outcome) => outcome.at(&section.place),
         }
     }
 
@@ -628,13 +733,14 @@ impl Trial<'_> {
         thread::sleep(Duration::from_millis(600));
         drop(stop);
         let Ok(recorder) = recorded.join() else { return self.failed("the path was not recorded", None) };
-        if let Err(outcome) = sent {
+        let failed = sent.err().or_else(|| self.new_lost(&before));
+        if let Some(outcome) = failed {
+            self.path = Some(recorder);
             return outcome;
         }
-        if let Some(outcome) = self.new_lost(&before) {
-            return outcome;
-        }
-        match compare(recorder.points(), &asked) {
+        let compared = compare(recorder.points(), &asked);
+        self.path = Some(recorder);
+        match compared {
             Err(trouble) => self.failed(trouble.to_string(), None),
             Ok(found) if found.all.greatest_mm > WITHIN_MM => {
                 let (mm, line) = (found.all.greatest_mm, found.all.line);

@@ -27,6 +27,16 @@ pub(super) enum Outcome {
     Skipped(String),
 }
 
+impl Outcome {
+    /// The outcome with this place, if a failure has none.
+    pub(super) fn at(self, at: &Place) -> Outcome {
+        match self {
+            Outcome::Failed { cause, place: None } => Outcome::Failed { cause, place: Some(at.clone()) },
+            other => other,
+        }
+    }
+}
+
 /// A step.
 struct Step {
     name: &'static str,

@@ -36,6 +36,10 @@ pub(crate) struct OwnArgs {
     /// Heat as slowly as a real printer does
     #[arg(long)]
     real_heat: bool,
+    /// The printer.cfg of the printer itself, for example the one before your change. klippy gets the other one, so
+    /// everything shows that does not fit the printer: a direction, an endstop, a thermistor
+    #[arg(long, value_name = "PRINTER.cfg")]
+    pub(crate) built_like: Option<PathBuf>,
     /// A description that lies over the one that comes out of printer.cfg
     #[arg(long, value_name = "FILE.toml")]
     pub(crate) with: Option<PathBuf>,
@@ -50,7 +54,7 @@ pub(crate) struct OwnArgs {
 impl OwnArgs {
     /// Whether an option needs a printer.cfg.
     pub(crate) fn is_used(&self) -> bool {
-        self.attempt || self.with.is_some() || self.folder.is_some() || self.in_place_pty
+        self.attempt || self.built_like.is_some() || self.with.is_some() || self.folder.is_some() || self.in_place_pty
     }
 
     pub(crate) fn pace(&self) -> Pace {

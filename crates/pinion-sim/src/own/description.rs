@@ -71,10 +71,6 @@ impl Description {
         free.unwrap_or(wanted)
     }
 
-    pub(super) fn has_bus(&self, kind: &str, key: &str) -> bool {
-        self.buses.contains_key(&format!("{kind} {key}"))
-    }
-
     /// The bus with this key; `make` describes it if it is new.
     pub(super) fn bus(&mut self, kind: &str, key: &str, make: impl FnOnce() -> Entry) -> String {
         if let Some(name) = self.buses.get(&format!("{kind} {key}")) {

@@ -8,6 +8,48 @@ use pinion_printer_config::{Limit, Section, Trouble};
 use super::description::Entry;
 use super::translate::Translator;
 
+/// How high a coil is above the nozzle's tip.
+const COIL_MM: f64 = 2.5;
+
+/// The frequency of a coil over the bed: `far_hz + near_hz * exp(-distance / fade_mm)`.
+#[derive(Debug, PartialEq)]
+struct Curve {
+    far_hz: f64,
+    near_hz: f64,
+    fade_mm: f64,
+}
+
+impl Curve {
+    const USUAL: Curve = Curve { far_hz: 3_100_000.0, near_hz: 300_000.0, fade_mm: 3.0 };
+
+    /// The curve through the first, the middle and the last point that klippy saved: pairs of a height and a frequency.
+    fn through(saved: &str) -> Option<Curve> {
+        let pair = |text: &str| {
+            let (height, hz) = text.split_once(':')?;
+            Some((height.trim().parse::<f64>().ok()?, hz.trim().parse::<f64>().ok()?))
+        };
+        let mut points = saved.split(',').map(pair).collect::<Option<Vec<(f64, f64)>>>()?;
+        points.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        let middle = points.len().saturating_sub(1) / 2;
+        let (&(low_mm, at_low), &(_, at_middle), &(high_mm, at_high)) =
+            (points.first()?, points.get(middle)?, points.last()?);
+        let (near_part, far_part) = (at_low - at_middle, at_middle - at_high);
+        if !(0.0 < far_part && far_part < near_part && low_mm < high_mm) {
+            return None;
+        }
+        let ratio = far_part / near_part;
+        let fade_mm = -(high_mm - low_mm) / 2.0 / ratio.ln();
+        let at_low_mm = near_part / (1.0 - ratio);
+        let near_hz = at_low_mm * ((low_mm + COIL_MM) / fade_mm).exp();
+        Some(Curve { far_hz: at_low - at_low_mm, near_hz, fade_mm })
+    }
+}
+
+/// How stiff a hot end on a load cell is.
+const CELL_G_PER_MM: f64 = 4000.0;
+/// The gain of a load cell without a calibration.
+const COUNTS_PER_GRAM: f64 = 400.0;
+
 impl Translator<'_> {
     pub(super) fn devices(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections() {
@@ -21,6 +63,7 @@ impl Translator<'_> {
             "probe" | "smart_effector" => self.probe(section),
             "bltouch" => self.bltouch(section),
             "probe_eddy_current" => self.eddy(section),
+            "load_cell" | "load_cell_probe" => self.load_cell(section),
             "filament_switch_sensor" => self.filament_switch(section),
             "filament_motion_sensor" => self.filament_motion(section),
             "servo" => self.servo(section),
@@ -76,7 +119,7 @@ impl Translator<'_> {
     }
 
     fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
-        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let bus = self.i2c(section)?;
         let address = section.whole("i2c_address", 0)?.unwrap_or(42);
         let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
         for axis in ["x", "y"] {
@@ -84,8 +127,41 @@ impl Translator<'_> {
             part = part.set(&format!("{axis}_offset_mm"), mm);
         }
         part = part.set_if("intb_pin", self.take(section, "intb_pin")?);
-        let part = part.set("coil_mm", 2.5).set("far_hz", 3_100_000.0).set("near_hz", 300_000.0).set("fade_mm", 3.0);
-        self.out.add("part", part.set("drive_current", 16));
+        let Curve { far_hz, near_hz, fade_mm } =
+            section.text("calibrate").and_then(Curve::through).unwrap_or(Curve::USUAL);
+        let part = part.set("coil_mm", COIL_MM).set("far_hz", far_hz).set("near_hz", near_hz).set("fade_mm", fade_mm);
+        let current = section.whole("reg_drive_current", 0)?.unwrap_or(16);
+        self.out.add("part", part.set("drive_current", current));
+        Ok(())
+    }
+
+    fn load_cell(&mut self, section: &Section) -> Result<(), Trouble> {
+        let chip = section.required("sensor_type")?.to_owned();
+        let number = |key: &str, default: f64| section.number(key, Limit::Any).map(|n| n.unwrap_or(default));
+        let cell = Entry::default().set("stiffness_g_per_mm", CELL_G_PER_MM);
+        let cell = cell.set("counts_per_gram", number("counts_per_gram", COUNTS_PER_GRAM)?);
+        let cell = cell.set("zero_counts", number("reference_tare_counts", 0.0)?).0;
+        let part = match chip.as_str() {
+            "hx711" | "hx717" => {
+                let [dout, sclk] = ["dout_pin", "sclk_pin"].map(|key| self.take(section, key));
+                let (Some(dout), Some(sclk)) = (dout?, sclk?) else { return Ok(()) };
+                let rate = section.whole("sample_rate", 1)?.unwrap_or(if chip == "hx711" { 80 } else { 320 });
+                let part = Entry::default().set("kind", "hx71x").set("chip", chip).set("dout_pin", dout);
+                part.set("sclk_pin", sclk).set("samples_per_s", rate)
+            }
+            "ads1220" => {
+                section.required("cs_pin")?;
+                let (Some((bus, select)), Some(ready)) =
+                    (self.spi(section, "cs_pin")?, self.take(section, "data_ready_pin")?)
+                else {
+                    return Ok(());
+                };
+                let part = Entry::default().set("kind", "ads1220").set("bus", bus).set_if("select_pin", select);
+                part.set("drdy_pin", ready)
+            }
+            _ => return Ok(()),
+        };
+        self.out.add("part", part.set("cell", cell));
         Ok(())
     }
 
@@ -189,7 +265,7 @@ impl Translator<'_> {
             return Ok(());
         }
         if section.text("cs_pin").is_none() {
-            let Some(bus) = self.i2c(section)? else { return Ok(()) };
+            let bus = self.i2c(section)?;
             let name = self.name_of("part", section);
             let address = section.whole("i2c_address", 0)?.unwrap_or(60);
             let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
@@ -265,7 +341,7 @@ impl Translator<'_> {
             }
         };
         let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
-        let Some(bus) = self.i2c(section)? else { return Ok(()) };
+        let bus = self.i2c(section)?;
         let name = self.name_of("part", section);
         let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
         self.out.add("part", part.set("address", address));
@@ -279,5 +355,23 @@ impl Translator<'_> {
         let part = Entry::default().set("kind", "spi_dac").set("name", name).set("chip", section.kind().to_lowercase());
         self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_coil_has_the_curve_that_klippy_saved() {
+        let Curve { far_hz, near_hz, fade_mm } = Curve::USUAL;
+        let hz = |mm: f64| far_hz + near_hz * (-(mm + COIL_MM) / fade_mm).exp();
+        let saved: Vec<String> = (0..=80).map(|n| f64::from(n) * 0.05).map(|mm| format!("{mm}:{}", hz(mm))).collect();
+        let found = Curve::through(&saved.join(",")).unwrap();
+        assert!((found.far_hz - far_hz).abs() < 1.0 && (found.near_hz - near_hz).abs() < 1.0, "{found:?}");
+        assert!((found.fade_mm - fade_mm).abs() < 1e-4, "{found:?}");
+        for nothing in ["", "1:2", "0:3,1:3,2:3", "0:x"] {
+            assert_eq!(Curve::through(nothing), None, "{nothing}");
+        }
     }
 }

@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use pinion_printer_config::{Section, Trouble};
+use pinion_sim::{Tmc2209Config, Tmc5160Config};
 
 use super::description::Entry;
 use super::translate::Translator;
@@ -26,28 +27,43 @@ impl Translator<'_> {
     fn driven(&mut self, section: &Section) -> Result<String, Trouble> {
         let stepper = section.name.split_once(' ').map_or("", |(_, stepper)| stepper).trim();
         self.axes.get(stepper).cloned().ok_or_else(|| {
-            let cause = format!("Could not find config section '[{stepper}]' required by TMC driver");
+            let cause = format!("Could not find config section '[{stepper}]' required by tmc driver");
             Trouble::new(cause).of(&section.place).remedy("add it, or remove the driver")
         })
+    }
+
+    /// The pin at which a driver says that its motor stalls. The level is the chip's: a `!` too many or too few shows.
+    fn take_diag(&mut self, section: &Section, key: &str) -> Result<Option<String>, Trouble> {
+        Ok(self.take(section, key)?.map(|pin| pin.trim_start_matches('!').to_owned()))
     }
 
     fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
         let axis = self.driven(section)?;
         section.required("cs_pin")?;
-        if section.whole("chain_length", 2)?.is_some() {
-            self.note(section, "is in a chain of drivers, which is not simulated", "its driver does not answer");
+        let chain = section.whole("chain_length", 2)?;
+        // klippy opens the bus of a chain for the first of its drivers.
+        let config = self.config;
+        let first = config.of_kind(kind).find(|other| other.text("cs_pin") == section.text("cs_pin"));
+        let Some((bus, select)) = self.spi(first.filter(|_| chain.is_some()).unwrap_or(section), "cs_pin")? else {
             return Ok(());
-        }
-        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        };
         let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
-        part = part.set_if("select_pin", select);
+        part = match chain {
+            Some(length) => {
+                section.required("chain_position")?;
+                let place = section.whole("chain_position", 1)?.unwrap_or(1);
+                let pin = self.pin(section, "cs_pin")?.map(|pin| pin.to_string());
+                part.set_if("select_pin", pin).set("chain_position", place).set("chain_length", length)
+            }
+            None => part.set_if("select_pin", select),
+        };
         // The motor's load suits the sensitivity that its owner found.
         if let Some(sgt) = section.whole("driver_sgt", -64)?.filter(|_| kind != "tmc2660") {
-            part = part.set("sg_free", 200 - 10 * sgt.min(63));
+            part = part.set("sg_free", Tmc5160Config::free_with_sgt(sgt.min(63) as i32));
         }
         let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
         for key in diags {
-            part = part.set_if(key, self.take(section, key)?);
+            part = part.set_if(key, self.take_diag(section, key)?);
         }
         self.out.add("part", part);
         Ok(())
@@ -57,21 +73,27 @@ impl Translator<'_> {
         let axis = self.driven(section)?;
         section.required("uart_pin")?;
         let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
-        if section.text("select_pins").is_some() {
-            self.note(section, "is behind a multiplexer, which is not simulated", "its driver does not answer");
-            return Ok(());
-        }
         self.take_pin(section, &pin);
         let mut part = Entry::default().set("kind", kind).set("axis", axis).set("uart_pin", pin.to_string());
+        let mut selects: Vec<toml::Value> = Vec::new();
+        for text in section.list("select_pins", ',') {
+            let select = self.pin_of(section, "select_pins", text)?;
+            // The drivers of a multiplexer share its lines.
+            self.take_pin(section, &select);
+            selects.push(select.to_string().into());
+        }
+        if !selects.is_empty() {
+            part = part.set("select_pins", selects);
+        }
         if let Some(tx) = self.pin(section, "tx_pin")?.filter(|pin| self.is_real(pin)) {
             self.take_pin(section, &tx);
             part = part.set("tx_pin", tx.to_string());
         }
         if kind == "tmc2209" {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
-            part = part.set_if("diag_pin", self.take(section, "diag_pin")?);
+            part = part.set_if("diag_pin", self.take_diag(section, "diag_pin")?);
             if let Some(threshold) = section.whole("driver_sgthrs", 0)? {
-                part = part.set("sg_free", (2 * threshold.min(255) + 100).clamp(250, 511));
+                part = part.set("sg_free", Tmc2209Config::free_with_sgthrs(threshold.min(255) as u32));
             }
         }
         self.out.add("part", part);

@@ -147,7 +147,7 @@ impl Translator<'_> {
                     _ => ("htu21d", 64),
                 };
                 let address = section.whole("i2c_address", 0)?.unwrap_or(address);
-                let Some(bus) = self.i2c(section)? else { return Ok(()) };
+                let bus = self.i2c(section)?;
                 let name = self.out.name("part", heater);
                 let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
                 self.out.add("part", part.set("address", address));

@@ -5,7 +5,7 @@
 
 /// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(crate) enum Kind {
     /// Simulated, or it needs no hardware.
     Known,
     /// Klipper's or Kalico's hardware without a simulation.
@@ -149,7 +149,7 @@ const KNOWN: &[&str] = &[
 ];
 
 /// The meaning of sections with this first word.
-pub(super) fn kind_of(word: &str) -> Kind {
+pub(crate) fn kind_of(word: &str) -> Kind {
     let is_numbered = |prefix: &str| {
         word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))
     };

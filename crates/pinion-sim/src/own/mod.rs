@@ -4,22 +4,26 @@
 //! - `translate`: sections become a description, as a table of TOML; `motion`, `heat`, `devices` are its parts
 //! - `sensors`: the tables of thermistors and amplifiers
 //! - `known`: the sections of Klipper and Kalico
+//! - `rules`: the options that klippy needs, and their ranges; `claims`: each pin has one owner
 //! - `serve`: the folder with the copy that klippy gets
 
 #![forbid(unsafe_code)]
 
 pub(crate) mod args;
+mod claims;
 mod description;
 mod devices;
 mod drivers;
 mod heat;
 mod known;
 mod motion;
+mod rules;
 pub(crate) mod run;
 mod sensors;
 pub(crate) mod serve;
 mod translate;
 
+pub(crate) use known::{Kind, kind_of};
 pub(crate) use translate::Pace;
 #[cfg(test)]
 use translate::{Translated, translate};

@@ -83,7 +83,10 @@ impl<'a> Translator<'a> {
                 .split_once(':')
                 .and_then(|(a, b)| Some((a.trim().parse::<f64>().ok()?, b.trim().parse::<f64>().ok()?)));
             let Some((driven, driving)) = numbers.filter(|(a, b)| *a > 0.0 && *b > 0.0) else {
-                let cause = format!("Unable to parse option 'gear_ratio' in section '{}'", section.name);
+                let cause = match ratio.split(':').count() {
+                    2 => format!("Unable to parse option 'gear_ratio' in section '{}'", section.name),
+                    _ => format!("Option 'gear_ratio' in section '{}' must have 2 elements", section.name),
+                };
                 return Err(section.trouble("gear_ratio", cause).remedy("write it as 80:16"));
             };
             gear *= driven / driving;

@@ -27,7 +27,7 @@ pub(crate) fn is_printer_cfg(path: &Path) -> bool {
 /// It is no printer, or has a mistake.
 pub(crate) fn read(path: &Path, args: &OwnArgs) -> Result<Own, Trouble> {
     let over = args.with.as_deref().map(table).transpose()?;
-    let own = Own::read(path, over, args.pace())?;
+    let own = Own::read(path, args.built_like.as_deref(), over, args.pace())?;
     own.notes.iter().for_each(|note| log::warn!("{note}"));
     Ok(own)
 }

@@ -15,7 +15,7 @@ use pinion_printer_config::{Config, Trouble};
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
-use super::translate::{Pace, Translated, translate};
+use super::translate::{Pace, Pins, Translated, translate};
 use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
@@ -35,15 +35,28 @@ pub(crate) struct Own {
 }
 
 impl Own {
-    /// Reads a printer.cfg. `over` is a description that lies over the one that comes out of it.
+    /// Reads a printer.cfg. `built_like` is the printer.cfg of the printer, if it is another one. `over` is a description
+    /// that lies over the one that comes out of it.
     ///
     /// # Errors
     ///
     /// It is no printer, or has a mistake.
-    pub(crate) fn read(path: &Path, over: Option<Table>, pace: Pace) -> Result<Own, Trouble> {
-        let mut config = Config::read(path)?;
-        config.put_constants_in();
-        let Translated { mut description, mcus, notes } = translate(&config, pace)?;
+    pub(crate) fn read(
+        path: &Path,
+        built_like: Option<&Path>,
+        over: Option<Table>,
+        pace: Pace,
+    ) -> Result<Own, Trouble> {
+        let (config, translated) = read(path, pace)?;
+        let Translated { mut description, mcus, pins, notes } = translated;
+        if let Some(built_like) = built_like {
+            let (_, built) = read(built_like, pace)?;
+            if built.mcus != mcus {
+                let cause = format!("it has the MCUs {}, and {} has others", built.mcus.join(", "), path.display());
+                return Err(Trouble::new(cause).of(built_like.display()).remedy("name a printer.cfg of this printer"));
+            }
+            description = with_places_of(built, &description, &pins);
+        }
         if let Some(over) = over {
             lay_over(&mut description, over);
         }
@@ -52,6 +65,45 @@ impl Own {
         let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
         Ok(Own { config, sim, description, mcus, notes })
     }
+}
+
+fn read(path: &Path, pace: Pace) -> Result<(Config, Translated), Trouble> {
+    let mut config = Config::read(path)?;
+    config.put_constants_in();
+    let translated = translate(&config, pace)?;
+    Ok((config, translated))
+}
+
+/// The printer with the pins and buses that another configuration names, too. Nothing is at them.
+fn with_places_of(built: Translated, other: &Table, pins: &Pins) -> Table {
+    let Translated { mut description, pins: own, .. } = built;
+    let tables = |description: &Table, kind: &str| -> Vec<Table> {
+        let list = description.get(kind).and_then(Value::as_array).into_iter().flatten();
+        list.filter_map(Value::as_table).cloned().collect()
+    };
+    let name = |table: &Table| table.get("name").and_then(Value::as_str).unwrap_or_default().to_owned();
+    for kind in ["spi_bus", "i2c_bus"] {
+        let known: Vec<String> = tables(&description, kind).iter().map(name).collect();
+        // A bus on bare lines is no more than its pins.
+        let new = tables(other, kind).into_iter().filter(|bus| bus.len() == 1 && !known.contains(&name(bus)));
+        let new: Vec<Value> = new.map(Value::Table).collect();
+        if let (false, Value::Array(list)) =
+            (new.is_empty(), description.entry(kind).or_insert_with(|| Value::Array(Vec::new())))
+        {
+            list.extend(new);
+        }
+    }
+    for board in description.get_mut("mcu").and_then(Value::as_array_mut).into_iter().flatten() {
+        let Some(board) = board.as_table_mut() else { continue };
+        let mcu = name(board);
+        let new = pins.get(&mcu).into_iter().flatten();
+        let new = new.filter(|pin| !own.get(&mcu).is_some_and(|own| own.contains(*pin)));
+        let new: Vec<Value> = new.map(|pin| pin.as_str().into()).collect();
+        if let Some(list) = board.get_mut("pins").and_then(Value::as_array_mut) {
+            list.extend(new);
+        }
+    }
+    description
 }
 
 /// Puts a description over another one. An entry with the name of another one changes its keys. All others are added.

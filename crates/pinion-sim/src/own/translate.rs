@@ -12,8 +12,10 @@ use pinion_printer_config::pins::{Aliases, MAIN, Pin};
 use pinion_printer_config::{Config, Section, Trouble};
 use toml::Table;
 
+use super::claims;
 use super::description::{Description, Entry};
 use super::known::{Kind, kind_of};
+use super::rules;
 
 /// How fast the heaters are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,6 +26,9 @@ pub(crate) enum Pace {
     Real,
 }
 
+/// The pins that a configuration names, by MCU.
+pub(crate) type Pins = BTreeMap<String, BTreeSet<String>>;
+
 /// A printer.cfg as a description.
 #[derive(Debug)]
 pub(crate) struct Translated {
@@ -31,6 +36,8 @@ pub(crate) struct Translated {
     pub(crate) description: Table,
     /// The MCUs in the order of the description, the main one first.
     pub(crate) mcus: Vec<String>,
+    /// All pins of the MCUs.
+    pub(crate) pins: Pins,
     /// Notes for the user: sections that are not simulated, and sections that klippy will refuse.
     pub(crate) notes: Vec<Trouble>,
 }
@@ -41,10 +48,13 @@ pub(crate) struct Translated {
 ///
 /// The first thing that klippy refuses, too, and without which there is no printer.
 pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Trouble> {
+    let (aliases, mcus) = (Aliases::read(config)?, mcus(config)?);
+    rules::check(config)?;
+    claims::check(config, &aliases, &mcus)?;
     let mut translator = Translator {
         config,
-        aliases: Aliases::read(config)?,
-        mcus: mcus(config)?,
+        aliases,
+        mcus,
         taken: HashMap::new(),
         enables: BTreeSet::new(),
         axes: HashMap::new(),
@@ -60,8 +70,9 @@ pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Troub
     translator.bare_buses()?;
     translator.strips()?;
     translator.strangers();
-    translator.boards();
-    Ok(Translated { description: translator.out.into_table(), mcus: translator.mcus, notes: translator.notes })
+    let pins = translator.boards();
+    let Translator { out, mcus, notes, .. } = translator;
+    Ok(Translated { description: out.into_table(), mcus, pins, notes })
 }
 
 /// The names of the MCUs.
@@ -182,23 +193,16 @@ impl Translator<'_> {
         Ok(Some((bus, select)))
     }
 
-    /// The I2C bus of a chip. `None` if it shares one line with another bus: the simulation has each line once.
-    pub(super) fn i2c(&mut self, section: &Section) -> Result<Option<String>, Trouble> {
+    /// The I2C bus of a chip.
+    pub(super) fn i2c(&mut self, section: &Section) -> Result<String, Trouble> {
         let mcu = section.text("i2c_mcu").unwrap_or(MAIN).to_owned();
         if section.text("i2c_software_scl_pin").is_some() {
             let [scl, sda] = ["i2c_software_scl_pin", "i2c_software_sda_pin"].map(|key| self.pin(section, key));
             let [scl, sda] = [scl?, sda?].map(|pin| pin.map(|pin| Translator::on(&mcu, &pin.name)));
-            let key = [&scl, &sda].map(|pin| pin.as_deref().unwrap_or("-")).join(" ");
-            let clock = scl.as_ref().and_then(|pin| Pin::parse(pin, true, true).ok());
-            let is_taken = clock.is_some_and(|pin| self.taken.contains_key(&(pin.chip, pin.name)));
-            if is_taken && !self.out.has_bus("i2c_bus", &key) {
-                self.note(section, "shares its clock line with another bus", "its chip is not simulated");
-                return Ok(None);
-            }
-            return Ok(Some(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)])));
+            return Ok(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)]));
         }
         let name = Translator::on(&mcu, section.text("i2c_bus").unwrap_or("i2c"));
-        Ok(Some(self.out.bus("i2c_bus", &name.clone(), || Entry::default().set("name", name))))
+        Ok(self.out.bus("i2c_bus", &name.clone(), || Entry::default().set("name", name)))
     }
 
     /// A bus on bare lines: one for each set of lines.
@@ -265,43 +269,33 @@ impl Translator<'_> {
         }
     }
 
-    /// The boards, with the pins that have nothing at them.
-    fn boards(&mut self) {
-        let mut pins: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
-        let mut free: Vec<Pin> = Vec::new();
+    /// The boards, with the pins that have nothing at them. Returns all pins.
+    fn boards(&mut self) -> Pins {
+        let mut all = Pins::new();
+        for (chip, pin) in self.taken.keys() {
+            all.entry(chip.clone()).or_default().insert(pin.clone());
+        }
         for section in self.config.sections().iter().filter(|section| !has_no_pins(section.kind())) {
-            for setting in section.settings() {
-                if !is_pin(&setting.key) {
-                    continue;
-                }
+            for setting in section.settings().iter().filter(|setting| is_pin(&setting.key)) {
                 for text in setting.value.split([',', '\n']).map(str::trim).filter(|text| !text.is_empty()) {
                     // Others have an alias before a `=`, or no pin at all: klippy decides.
                     let Ok(pin) = self.pin_of(section, &setting.key, text) else { continue };
-                    free.push(pin);
+                    if self.is_real(&pin) && is_name(&pin.name) {
+                        all.entry(pin.chip).or_default().insert(pin.name);
+                    }
                 }
             }
         }
-        let mut all: BTreeMap<String, Vec<String>> = BTreeMap::new();
-        for (chip, pin) in self.taken.keys() {
-            all.entry(chip.clone()).or_default().push(pin.clone());
-        }
-        for pin in &free {
-            all.entry(pin.chip.clone()).or_default().push(pin.name.clone());
-            let is_taken = self.taken.contains_key(&(pin.chip.clone(), pin.name.clone()));
-            if let Some(mcu) = self.mcus.iter().find(|mcu| **mcu == pin.chip).filter(|_| !is_taken)
-                && is_name(&pin.name)
-            {
-                pins.entry(mcu).or_default().insert(pin.name.clone());
-            }
-        }
         for (number, mcu) in self.mcus.iter().enumerate() {
-            let names = all.get(mcu).map_or(&[][..], Vec::as_slice);
-            let free: Vec<toml::Value> = pins.remove(mcu.as_str()).into_iter().flatten().map(Into::into).collect();
+            let names: Vec<String> = all.get(mcu).into_iter().flatten().cloned().collect();
+            let is_free = |pin: &&String| !self.taken.contains_key(&(mcu.clone(), (*pin).clone()));
+            let free: Vec<toml::Value> = names.iter().filter(is_free).map(|pin| pin.as_str().into()).collect();
             // Crystals differ by some ppm.
             let drift_ppm = [0.0, 12.0, -9.0, 17.0, -15.0][number % 5];
-            let board = Entry::default().set("name", mcu.as_str()).set("chip", chip_of(mcu, names));
+            let board = Entry::default().set("name", mcu.as_str()).set("chip", chip_of(mcu, &names));
             self.out.add("mcu", board.set("drift_ppm", drift_ppm).set("pins", free));
         }
+        all
     }
 
     /// The chip of an MCU, as far as its pins show it.

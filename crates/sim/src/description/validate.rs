@@ -16,6 +16,9 @@ use super::printer::{Kinematics, Printer};
 use super::rails::Gears;
 use super::thermistor::KELVIN;
 
+/// Software buses may share lines.
+const LINES: Option<&str> = Some("lines of buses");
+
 impl Printer<'_> {
     /// Checks that the values make a printer.
     ///
@@ -66,10 +69,9 @@ impl Printer<'_> {
             match bus.lines() {
                 None => pins.claim(whose, "name", Some(&bus.output_pin()))?,
                 Some([miso, mosi, sclk]) => {
-                    pins.claim(whose, "miso_pin", Some(miso))?;
-                    // A chip without a data input has no line for it.
-                    pins.claim(whose, "mosi_pin", Some(mosi).filter(|mosi| mosi.name != miso.name))?;
-                    pins.claim(whose, "sclk_pin", Some(sclk))?;
+                    for (key, pin) in [("miso_pin", miso), ("mosi_pin", mosi), ("sclk_pin", sclk)] {
+                        pins.claim_for(LINES, whose, key, Some(pin))?;
+                    }
                 }
             }
         }
@@ -81,7 +83,7 @@ impl Printer<'_> {
         for bus in self.i2c_buses {
             bus.validate()?;
             for (key, pin) in ["scl_pin", "sda_pin"].into_iter().zip(bus.lines().into_iter().flatten()) {
-                pins.claim(&format!("i2c_bus `{}`", bus.name), key, Some(pin))?;
+                pins.claim_for(LINES, &format!("i2c_bus `{}`", bus.name), key, Some(pin))?;
             }
         }
         Ok(())

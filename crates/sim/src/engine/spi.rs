@@ -75,12 +75,45 @@ impl Wire for SelectLine {
     }
 }
 
-/// A chip's place on its bus.
+/// A chip's place on its bus, or that of a chain of chips.
 struct Socket {
     name: String,
     /// `None` for the only chip of a bus, which is always selected.
     select: Option<Arc<SelectLine>>,
-    chip: Box<dyn SpiChip>,
+    /// In a chain each chip gets the bytes that leave the one before it.
+    chips: Vec<Box<dyn SpiChip>>,
+}
+
+impl Socket {
+    fn knows_mode(&self, mode: u8) -> bool {
+        self.chips.iter().all(|chip| chip.knows_mode(mode))
+    }
+
+    fn select(&mut self, rate_hz: u32) {
+        self.chips.iter_mut().for_each(|chip| chip.select(rate_hz));
+    }
+
+    fn exchange(&mut self, byte: u8) -> u8 {
+        self.chips.iter_mut().fold(byte, |byte, chip| chip.exchange(byte))
+    }
+
+    fn deselect(&mut self) {
+        self.chips.iter_mut().for_each(|chip| chip.deselect());
+    }
+}
+
+/// A chip of a chain without a description: its shift register of 40 bits.
+struct Shift([u8; 5]);
+
+impl SpiChip for Shift {
+    fn knows_mode(&self, _mode: u8) -> bool {
+        true
+    }
+
+    fn exchange(&mut self, byte: u8) -> u8 {
+        self.0.rotate_left(1);
+        std::mem::replace(&mut self.0[4], byte)
+    }
 }
 
 /// A record of transfers, one line each.
@@ -149,7 +182,28 @@ impl SpiBus {
     /// Puts a chip on the bus.
     pub(crate) fn solder(&mut self, name: String, select: Option<Arc<SelectLine>>, chip: Box<dyn SpiChip>) {
         let wires = self.wires.get_mut().unwrap_or_else(PoisonError::into_inner);
-        wires.sockets.push(Socket { name, select, chip });
+        wires.sockets.push(Socket { name, select, chips: vec![chip] });
+    }
+
+    /// Puts a chip at a place of the chain with this name, counted from 0. `select` makes the line of a new chain.
+    pub(crate) fn solder_in_chain(
+        &mut self,
+        name: &str,
+        (place, length): (usize, usize),
+        select: impl FnOnce() -> Arc<SelectLine>,
+        chip: Box<dyn SpiChip>,
+    ) {
+        let wires = self.wires.get_mut().unwrap_or_else(PoisonError::into_inner);
+        let known = wires.sockets.iter().position(|socket| socket.name == name);
+        let at = known.unwrap_or_else(|| {
+            wires.sockets.push(Socket { name: name.to_owned(), select: Some(select()), chips: Vec::new() });
+            wires.sockets.len() - 1
+        });
+        let chips = &mut wires.sockets[at].chips;
+        while chips.len() < length {
+            chips.push(Box::new(Shift([0; 5])));
+        }
+        chips[place] = chip;
     }
 
     /// Puts a listener on the data output alone.
@@ -163,21 +217,21 @@ impl SpiBus {
         let Wires { sockets, listeners, trace } = &mut *wires;
         let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| line.low.load(Ordering::Relaxed));
         let mut chips: Vec<&mut Socket> =
-            sockets.iter_mut().filter(|socket| is_selected(socket) && socket.chip.knows_mode(mode)).collect();
+            sockets.iter_mut().filter(|socket| is_selected(socket) && socket.knows_mode(mode)).collect();
         let sent = bytes.to_vec();
         let mut levels = vec![String::new(); trace.pins.len()];
         let pace = Pace { start: Instant::now(), delay: self.delay, bytes: bytes.len() };
-        chips.iter_mut().for_each(|socket| socket.chip.select(rate_hz));
+        chips.iter_mut().for_each(|socket| socket.select(rate_hz));
         for (n, byte) in bytes.iter_mut().enumerate() {
             pace.wait(n + 1);
             for ((_, lamp, inverted), levels) in trace.pins.iter().zip(&mut levels) {
                 levels.push(if lamp.is_on() != *inverted { '1' } else { '0' });
             }
             // An undriven wire is pulled up. A chip that drives it low wins.
-            *byte = chips.iter_mut().fold(0xff, |wire, socket| wire & socket.chip.exchange(*byte));
+            *byte = chips.iter_mut().fold(0xff, |wire, socket| wire & socket.exchange(*byte));
         }
         pace.wait(pace.bytes);
-        chips.iter_mut().for_each(|socket| socket.chip.deselect());
+        chips.iter_mut().for_each(|socket| socket.deselect());
         listeners.iter_mut().for_each(|listener| listener.hear(rate_hz, &sent));
         trace.record(&chips, &sent, bytes, &levels)
     }

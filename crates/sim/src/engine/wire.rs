@@ -344,6 +344,30 @@ impl Wire for EnablePin {
     }
 }
 
+/// A line that parts read.
+#[derive(Default)]
+pub(crate) struct LevelLine(AtomicBool);
+
+impl LevelLine {
+    pub(crate) fn is_high(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+impl Wire for LevelLine {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        "select line of UARTs".to_owned()
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.0.store(on, Ordering::Relaxed);
+    }
+}
+
 /// A rail's endstop.
 pub(crate) struct EndstopPin(pub(crate) Arc<Rail>);
 

@@ -27,6 +27,7 @@ use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
+use crate::engine::wire::LevelLine;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
@@ -62,6 +63,10 @@ const CHOPCONF_DEDGE: u32 = 1 << 29;
 
 /// SG_RESULT of a free motor; the full load makes it 0. The data sheet gives no formula.
 const SG_FREE: u32 = 250;
+/// How far a free motor is above twice its SGTHRS, at least.
+const SG_MARGIN: u32 = 100;
+/// Highest SG_RESULT.
+const SG_MAX: u32 = 511;
 /// The SGTHRS at which a fifth of the full load counts as a stall.
 const SGTHRS_FOR_HOMING: u32 = 100;
 
@@ -134,6 +139,9 @@ pub struct UartDriverConfig<const MODEL: u16> {
     pub uart_port: Option<PinName>,
     /// The board's sending end, joined to the wire by a resistor.
     pub tx_pin: Option<PinName>,
+    /// The lines of a multiplexer that connect it to the wire, each at its level: `!` for low.
+    #[serde(default)]
+    pub select_pins: Vec<PinName>,
     /// Its address, 0 to 3, by MS1 and MS2.
     #[serde(default)]
     pub address: u8,
@@ -150,6 +158,13 @@ fn default_sg_free() -> u32 {
     SG_FREE
 }
 
+impl<const MODEL: u16> UartDriverConfig<MODEL> {
+    /// The `sg_free` of a motor for which this SGTHRS is right: a free motor is well above twice that.
+    pub fn free_with_sgthrs(sgthrs: u32) -> u32 {
+        (2 * sgthrs + SG_MARGIN).clamp(SG_FREE, SG_MAX)
+    }
+}
+
 impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
     fn name(&self) -> String {
         format!("tmc{MODEL} {}", self.axis)
@@ -157,6 +172,10 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
         vec![("diag_pin", self.diag_pin.as_ref())]
+    }
+
+    fn select_pins(&self) -> &[PinName] {
+        &self.select_pins
     }
 
     fn uart_pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
@@ -172,7 +191,7 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         if self.address > most {
             return wrong(whose, "address", &format!("{} is none", self.address), &format!("give {range}"));
         }
-        if !(1..=511).contains(&self.sg_free) {
+        if !(1..=SG_MAX).contains(&self.sg_free) {
             return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give 1 to 511");
         }
         match (&self.uart_pin, &self.uart_port) {
@@ -196,6 +215,7 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
         let chip = Tmc2209::new(&self.name(), MODEL, (self.address, self.sg_free), axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
+        let chip = Selected { chip, by: workshop.selected_by(self) };
         if self.uart_port.is_some() {
             workshop.solder_serial(self, PortUart(Box::new(chip)));
             return Ok(());
@@ -224,6 +244,10 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         cfg.key_if("uart_pin", self.uart_pin.as_ref());
         cfg.key_if("uart_pin", self.uart_port.as_ref());
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
+        if !self.select_pins.is_empty() {
+            let pins: Vec<String> = self.select_pins.iter().map(ToString::to_string).collect();
+            cfg.key("select_pins", pins.join(", "));
+        }
         if MODEL == 2209 {
             cfg.key("uart_address", self.address);
         }
@@ -311,6 +335,23 @@ impl Tmc2209 {
         if address == CHOPCONF {
             self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
         }
+    }
+}
+
+/// A chip that hears the wire while lines have their levels.
+struct Selected {
+    chip: Tmc2209,
+    by: Vec<(Arc<LevelLine>, bool)>,
+}
+
+impl UartChip for Selected {
+    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
+        let is_selected = self.by.iter().all(|(line, high)| line.is_high() == *high);
+        if is_selected { self.chip.hear(message, now) } else { None }
+    }
+
+    fn send_delay(&self) -> u64 {
+        self.chip.send_delay()
     }
 }
 

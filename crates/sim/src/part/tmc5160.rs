@@ -77,6 +77,8 @@ const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
 /// are values of a common motor: the data sheet gives no formula.
 const SG_FREE: i32 = 200;
 const SG_FALL: i32 = 300;
+/// Longest chain of drivers.
+const CHAIN_MAX: usize = 32;
 const SG_PER_SGT: i32 = 10;
 
 use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
@@ -255,6 +257,10 @@ pub struct SpiDriverConfig<const MODEL: u16> {
     pub diag1_pin: Option<PinName>,
     /// DIAG0, an open drain too, with the same meaning if the host asks for it.
     pub diag0_pin: Option<PinName>,
+    /// Its place in a chain of drivers with one select pin; 1 is the one at the data output.
+    pub chain_position: Option<usize>,
+    /// The number of drivers in that chain.
+    pub chain_length: Option<usize>,
     /// SG_RESULT of a free motor with SGT at 0. Each step of SGT adds 10. A motor with full load has 300 less.
     #[serde(default = "default_sg_free")]
     pub sg_free: i32,
@@ -262,6 +268,13 @@ pub struct SpiDriverConfig<const MODEL: u16> {
 
 fn default_sg_free() -> i32 {
     SG_FREE
+}
+
+impl<const MODEL: u16> SpiDriverConfig<MODEL> {
+    /// The `sg_free` of a motor for which this SGT is right: with it, a free motor has the usual SG_RESULT.
+    pub fn free_with_sgt(sgt: i32) -> i32 {
+        SG_FREE - SG_PER_SGT * sgt
+    }
 }
 
 impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
@@ -277,7 +290,20 @@ impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
         vec![("diag1_pin", self.diag1_pin.as_ref()), ("diag0_pin", self.diag0_pin.as_ref())]
     }
 
+    fn chain(&self) -> Option<(usize, usize)> {
+        Some((self.chain_position?.checked_sub(1)?, self.chain_length?))
+    }
+
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
+        let is_right = |place: usize, length: usize| (1..=length).contains(&place) && length <= CHAIN_MAX;
+        match (self.chain_position, self.chain_length) {
+            (None, None) => {}
+            (Some(place), Some(length)) if is_right(place, length) && self.select_pin.is_some() => {}
+            _ => {
+                let remedy = format!("give both, 1 to {CHAIN_MAX}, and a select_pin");
+                return wrong(whose, "chain_position", "it needs a place within chain_length", &remedy);
+            }
+        }
         if !(-1000..=1000).contains(&self.sg_free) {
             return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give -1000 to 1000");
         }
@@ -299,6 +325,8 @@ impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
         cfg.section(format_args!("tmc{MODEL} {}", layout.stepper(&self.axis)));
         may_be_left_out(cfg);
         cfg.spi(&self.bus, self.select_pin.as_ref());
+        cfg.key_if("chain_position", self.chain_position);
+        cfg.key_if("chain_length", self.chain_length);
         cfg.key("run_current", 0.8);
         match MODEL {
             2240 => cfg.key("rref", 12000),

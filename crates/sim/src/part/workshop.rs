@@ -16,7 +16,7 @@ use crate::engine::noise::Noise;
 use crate::engine::physics::Heater;
 use crate::engine::serial::{SerialChip, SerialWire};
 use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
-use crate::engine::wire::{ControllerPin, Kind, Wire, WiredPin};
+use crate::engine::wire::{ControllerPin, Kind, LevelLine, Wire, WiredPin};
 use crate::engine::world::{Sight, World};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -50,6 +50,16 @@ pub(crate) trait Part {
         Vec::new()
     }
 
+    /// Its place in a chain of chips at its select pin, counted from 0, and the chain's length.
+    fn chain(&self) -> Option<(usize, usize)> {
+        None
+    }
+
+    /// The lines that connect its UART, each at its level. Several chips may share a line.
+    fn select_pins(&self) -> &[PinName] {
+        &[]
+    }
+
     /// The pins of its wires by their keys, without the pin that selects it on its bus.
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
         Vec::new()
@@ -79,6 +89,8 @@ pub(crate) struct Workshop<'a> {
     pub(crate) spi_buses: Vec<SpiBus>,
     pub(crate) i2c_buses: Vec<I2cBus>,
     pub(crate) serial_wires: Vec<SerialWire>,
+    /// The lines that connect UARTs, by their names.
+    pub(crate) levels: Vec<(String, Arc<LevelLine>)>,
     /// The wires of UARTs on lines, by the name of the line.
     pub(crate) uarts: Vec<(String, Arc<Mutex<Uart>>)>,
 }
@@ -159,6 +171,21 @@ impl Workshop<'_> {
     /// Puts a chip on its SPI bus.
     pub(crate) fn solder_spi(&mut self, part: &dyn Part, chip: impl SpiChip + 'static) {
         let Some(Socket::Spi { bus, select_pin }) = part.socket() else { return };
+        if let (Some(place), Some(pin)) = (part.chain(), select_pin) {
+            let name = format!("chain at {}", pin.name);
+            let line = Arc::new(SelectLine::new(&name));
+            let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) else { return };
+            let mut is_new = false;
+            let select = || {
+                is_new = true;
+                line.clone()
+            };
+            bus.solder_in_chain(&name, place, select, Box::new(chip));
+            if is_new {
+                self.wire_shared(Some(pin), line);
+            }
+            return;
+        }
         let select = select_pin.map(|_| Arc::new(SelectLine::new(&part.name())));
         if let Some(line) = &select {
             self.pins.extend(select_pin.map(|pin| WiredPin::new(pin, line.clone())));
@@ -166,6 +193,22 @@ impl Workshop<'_> {
         if let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) {
             bus.solder(part.name(), select, Box::new(chip));
         }
+    }
+
+    /// The levels of the lines that connect a part's UART, and the levels at which they do.
+    pub(crate) fn selected_by(&mut self, part: &dyn Part) -> Vec<(Arc<LevelLine>, bool)> {
+        let mut lines = Vec::new();
+        for pin in part.select_pins() {
+            let known = self.levels.iter().find(|(name, _)| *name == pin.name).map(|(_, line)| line.clone());
+            let line = known.unwrap_or_else(|| {
+                let line = Arc::new(LevelLine::default());
+                self.levels.push((pin.name.clone(), line.clone()));
+                self.wire_shared(Some(&PinName { name: pin.name.clone(), inverted: false }), line.clone());
+                line
+            });
+            lines.push((line, !pin.inverted));
+        }
+        lines
     }
 
     /// Puts a part on the data output of its SPI bus.

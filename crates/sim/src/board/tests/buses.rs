@@ -49,6 +49,8 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
         PartConfig::Tmc5160(Tmc5160Config {
             diag1_pin: None,
             diag0_pin: None,
+            chain_position: None,
+            chain_length: None,
             sg_free: 200,
             bus: "spidev1.0".into(),
             select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
@@ -132,6 +134,61 @@ fn heard(port: &mut dyn SerialPort, message: &[u8]) -> Vec<u8> {
 }
 
 #[test]
+fn drivers_in_a_chain_have_one_select_pin() {
+    let mut config = SimConfig::default_printer();
+    let driver = |axis: &str, place| {
+        PartConfig::Tmc5160(Tmc5160Config {
+            diag1_pin: None,
+            diag0_pin: None,
+            chain_position: Some(place),
+            chain_length: Some(3),
+            sg_free: 200,
+            bus: "spidev1.0".into(),
+            select_pin: PinName::try_from("cs".to_owned()).ok(),
+            axis: axis.into(),
+        })
+    };
+    // Nothing is described at the place in the middle.
+    config.parts = vec![driver("y", 3), driver("x", 1)];
+    let mut bench = Bench::new(config);
+    let mut chain = bench.spi("spidev1.0", Some("cs")).unwrap();
+    // The first bytes go to the last driver: GCONF of y gets 4, and GCONF of x gets 8.
+    assert_eq!(&exchange(&mut chain, "800000000400000000008000000008")[..10], "0900000000", "the status of y");
+    let read = exchange(&mut chain, "000000000000000000000000000000");
+    assert_eq!((&read[..10], &read[20..]), ("0900000004", "0900000008"));
+}
+
+#[test]
+fn a_multiplexer_connects_a_driver_to_the_wire() {
+    let mut config = SimConfig::default_printer();
+    let pin = |name: &str| PinName::try_from(name.to_owned()).ok();
+    let driver = |axis: &str, address, select: &str| {
+        PartConfig::Tmc2209(Tmc2209Config {
+            uart_pin: None,
+            uart_port: pin("ttyAMA1"),
+            tx_pin: None,
+            select_pins: pin(select).into_iter().collect(),
+            address,
+            axis: axis.into(),
+            diag_pin: None,
+            sg_free: 250,
+        })
+    };
+    config.parts = vec![driver("x", 0, "mux"), driver("y", 3, "!mux")];
+    let mut bench = Bench::new(config);
+    let port = bench.pin("ttyAMA1");
+    let mut port = bench.board.serial(port, 40_000).unwrap().unwrap();
+    let mux = bench.output("mux", false);
+    for (high, answers) in [(false, [false, true]), (true, [true, false])] {
+        mux.write(high).unwrap();
+        for (read, answers) in [[0xf5, 0, 2, 0xc8], [0xf5, 3, 2, 0x25]].iter().zip(answers) {
+            // The port hears its own four bytes.
+            assert_eq!(heard(&mut *port.device, read).len() > 4, answers, "{read:?} with the line at {high}");
+        }
+    }
+}
+
+#[test]
 fn drivers_share_the_wire_of_a_serial_port() {
     let mut config = SimConfig::default_printer();
     let pin = |name: &str| PinName::try_from(name.to_owned()).ok();
@@ -140,6 +197,7 @@ fn drivers_share_the_wire_of_a_serial_port() {
             uart_pin: None,
             uart_port: pin("ttyAMA1"),
             tx_pin: None,
+            select_pins: Vec::new(),
             address,
             axis: axis.into(),
             diag_pin: None,
