@@ -103,7 +103,7 @@ fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: 
     while at < Clock::from_ticks(end) {
         waiter.wait(at, Some(at), |_| false);
         let now = clock.now();
-        lateness.record(now.since(at));
+        lateness.record(Ticks::between(at, now));
         at = at + PERIOD;
         if at < now {
             at = now + PERIOD;
@@ -236,9 +236,9 @@ mod tests {
     use super::*;
 
     /// A half in which the events were this late, in ticks.
-    fn half(name: &'static str, late: &[i64]) -> Half {
+    fn half(name: &'static str, late: &[u32]) -> Half {
         let mut edge = Lateness::default();
-        late.iter().for_each(|late| edge.record(*late));
+        late.iter().for_each(|late| edge.record(Ticks(*late)));
         Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
     }
 
@@ -254,7 +254,7 @@ mod tests {
     #[test]
     fn the_verdict_follows_the_worse_half() {
         let judged =
-            |loaded: &[i64]| judge(&[half("idle", &[1; 1000]), half("under load", loaded)], Scheduling::RealTime);
+            |loaded: &[u32]| judge(&[half("idle", &[1; 1000]), half("under load", loaded)], Scheduling::RealTime);
         assert_eq!(judged(&[1; 1000]).fitness, Fitness::Steppers);
         assert_eq!(judged(&[40_000; 1000]).fitness, Fitness::SlowOutputs);
         let verdict = judged(&[5_000_000; 1000]);

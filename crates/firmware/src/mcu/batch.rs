@@ -49,8 +49,7 @@ impl Mcu {
         let mut batch = Batch { now: self.last_read(), bank: None, high: 0, low: 0 };
         let State { scheduler, objects, .. } = &mut self.state;
         let joining = scheduler.of_instant(at).take_while(|timer| {
-            let object = timer.oid().and_then(|oid| objects.get_mut(oid));
-            object.is_some_and(|object| object.join(&mut batch))
+            objects.get_mut(timer.oid()).is_some_and(|object| object.join(&mut batch))
         });
         let count = joining.count();
         if let Some(bank) = batch.bank {

@@ -11,7 +11,7 @@ use crate::time::{Clock, Ticks, TimeSource, Timing};
 
 use super::stats::Stats;
 use super::timers::Timers;
-use super::{Context, Mcu, Next, Note, OBJECTS_MAX, Oid, TimerId, WireClock, base};
+use super::{Context, Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
 
 /// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
@@ -207,12 +207,10 @@ impl Scheduler {
     fn take_due(&mut self) -> Option<(Clock, TimerId)> {
         let (at, timer) = self.timers.pop()?;
         if timer.is_exact() {
-            let late = self.last_read.since(at);
+            let late = Ticks::between(at, self.last_read);
             self.lateness.record(late);
-            if late > i64::from(self.latest.late.0) {
-                let late = Ticks(u32::try_from(late).unwrap_or(u32::MAX));
-                let oid = timer.oid().and_then(Oid::number);
-                self.latest = Latest { late, oid };
+            if late > self.latest.late {
+                self.latest = Latest { late, oid: timer.oid().number() };
             }
         }
         Some((at, timer))
@@ -295,8 +293,8 @@ impl Mcu {
     #[inline(always)]
     pub(super) fn run_timer(&mut self) {
         let Some((at, timer)) = self.state.scheduler.take_due() else { return };
-        let Some(oid) = timer.oid() else { return self.run_own_timer(timer, at) };
-        let Some(mut object) = self.state.objects.take(oid) else { return };
+        let oid = timer.oid();
+        let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };
         self.state.scheduler.timing.due.set(Some(at));
         let result = object.event(&mut Context::new(&mut self.state, oid), timer.timer(), at);
         self.state.scheduler.timing.due.set(None);
@@ -321,7 +319,9 @@ impl Mcu {
         match timer {
             TimerId::RETRY => self.state.retry(),
             TimerId::HOLD => self.held_too_long(),
-            _ => self.send_stats(at),
+            TimerId::STATS => self.send_stats(at),
+            // The timer of an object that is gone.
+            _ => {}
         }
         self.state.scheduler.timing.due.set(None);
     }

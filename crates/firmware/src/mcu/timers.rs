@@ -30,8 +30,8 @@ impl Timer {
 /// Identifies a timer of an object, or the MCU's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct TimerId {
-    /// The object; `None` for the MCU's own timers.
-    oid: Option<Oid>,
+    /// The object; [`Oid::NONE`] for the MCU's own timers.
+    oid: Oid,
     timer: Timer,
 }
 
@@ -45,12 +45,12 @@ impl TimerId {
     pub(super) const HOLD: TimerId = TimerId::own(2);
 
     const fn own(number: u8) -> TimerId {
-        TimerId { oid: None, timer: Timer::sampling(number) }
+        TimerId { oid: Oid::NONE, timer: Timer::sampling(number) }
     }
 
     /// A timer of an object.
     pub(super) const fn of(oid: Oid, timer: Timer) -> TimerId {
-        TimerId { oid: Some(oid), timer }
+        TimerId { oid, timer }
     }
 
     /// Whether the core must be awake when it is due.
@@ -58,8 +58,8 @@ impl TimerId {
         self.timer.is_exact
     }
 
-    /// The object whose timer it is.
-    pub(super) const fn oid(self) -> Option<Oid> {
+    /// The object whose timer it is; [`Oid::NONE`] for the MCU's own timers.
+    pub(super) const fn oid(self) -> Oid {
         self.oid
     }
 
@@ -119,14 +119,13 @@ impl Timers {
     #[inline]
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
         debug_assert!(!self.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
-        let mut place = self.waiting.len();
         self.waiting.push((at, timer));
         // Its place is usually near the end, so moving entries one by one is faster than memmove.
+        let mut place = self.waiting.len() - 1;
         while place > 0 && self.waiting[place - 1].0 <= at {
-            self.waiting[place] = self.waiting[place - 1];
+            self.waiting.swap(place - 1, place);
             place -= 1;
         }
-        self.waiting[place] = (at, timer);
     }
 
     pub(super) fn remove(&mut self, timer: TimerId) {
@@ -135,7 +134,7 @@ impl Timers {
 
     /// Removes the timers of objects.
     pub(super) fn clear(&mut self) {
-        self.waiting.retain(|(_, timer)| timer.oid.is_none());
+        self.waiting.retain(|(_, timer)| timer.oid == Oid::NONE);
     }
 }
 
