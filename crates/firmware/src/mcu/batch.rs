@@ -44,13 +44,12 @@ impl Mcu {
     /// Runs the next timer and the others of its instant, as far as each begins with an edge on the same bank. No
     /// command runs between them.
     #[inline(never)]
-    pub(super) fn run_batch(&mut self) {
-        let Some(at) = self.next_timer() else { return };
+    pub(super) fn run_batch(&mut self, at: Clock) {
         let mut batch = Batch { now: self.last_read(), bank: None, high: 0, low: 0 };
         let State { scheduler, objects, .. } = &mut self.state;
-        let joining = scheduler.of_instant(at).take_while(|timer| {
-            objects.get_mut(timer.oid()).is_some_and(|object| object.join(&mut batch))
-        });
+        let joining = scheduler
+            .of_instant(at)
+            .take_while(|timer| objects.get_mut(timer.oid()).is_some_and(|object| object.join(&mut batch)));
         let count = joining.count();
         if let Some(bank) = batch.bank {
             bank.change(batch.high, batch.low);

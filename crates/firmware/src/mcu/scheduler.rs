@@ -202,10 +202,10 @@ impl Scheduler {
         self.timing.step_late_limit
     }
 
-    /// Takes the next timer, and records how late it is.
+    /// Takes the next timer, which is this one, and records how late it is.
     #[inline(always)]
-    fn take_due(&mut self) -> Option<(Clock, TimerId)> {
-        let (at, timer) = self.timers.pop()?;
+    fn take(&mut self, at: Clock, timer: TimerId) {
+        self.timers.pop();
         if timer.is_exact() {
             let late = Ticks::between(at, self.last_read);
             self.lateness.record(late);
@@ -213,7 +213,6 @@ impl Scheduler {
                 self.latest = Latest { late, oid: timer.oid().number() };
             }
         }
-        Some((at, timer))
     }
 }
 
@@ -256,19 +255,16 @@ impl Mcu {
     /// MCU stops. A batch counts as one timer.
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.state.scheduler.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
-            if self
-                .state
-                .scheduler
-                .timers
-                .next()
-                .is_none_or(|at| at > self.state.scheduler.last_read && at > self.now())
-            {
-                self.state.scheduler.is_behind = false;
+            let scheduler = &mut self.state.scheduler;
+            let Some((at, _)) =
+                scheduler.timers.first().filter(|(at, _)| *at <= scheduler.last_read || *at <= scheduler.now())
+            else {
+                scheduler.is_behind = false;
                 return false;
-            }
+            };
             // Almost all timers are alone.
-            if self.state.scheduler.has_banks && self.state.scheduler.timers.has_several_next() {
-                self.run_batch();
+            if scheduler.has_banks && scheduler.timers.has_several_next() {
+                self.run_batch(at);
             } else {
                 self.run_timer();
             }
@@ -292,7 +288,8 @@ impl Mcu {
 
     #[inline(always)]
     pub(super) fn run_timer(&mut self) {
-        let Some((at, timer)) = self.state.scheduler.take_due() else { return };
+        let Some((at, timer)) = self.state.scheduler.timers.first() else { return };
+        self.state.scheduler.take(at, timer);
         let oid = timer.oid();
         let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };
         self.state.scheduler.timing.due.set(Some(at));
@@ -300,10 +297,10 @@ impl Mcu {
         self.state.scheduler.timing.due.set(None);
         match result {
             Ok(next) => {
-                self.state.objects.put_back(oid, object);
                 if let Next::At(at) = next {
                     self.state.scheduler.timers.insert(at, timer);
                 }
+                self.state.objects.put_back(oid, object);
             }
             Err(stop) => {
                 let stop = self.state.blame(stop, object.kind(), oid);
