@@ -59,10 +59,8 @@ impl Mcu {
         }
         for _ in 0..count.max(1) {
             // A failure removes the other timers.
-            if self.next_timer() != Some(at) {
-                break;
-            }
-            self.run_timer();
+            let Some(timer) = self.state.scheduler.of_instant(at).next() else { break };
+            self.run_timer(at, timer);
         }
     }
 }

@@ -256,7 +256,7 @@ impl Mcu {
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.state.scheduler.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
             let scheduler = &mut self.state.scheduler;
-            let Some((at, _)) =
+            let Some((at, timer)) =
                 scheduler.timers.first().filter(|(at, _)| *at <= scheduler.last_read || *at <= scheduler.now())
             else {
                 scheduler.is_behind = false;
@@ -266,7 +266,7 @@ impl Mcu {
             if scheduler.has_banks && scheduler.timers.has_several_next() {
                 self.run_batch(at);
             } else {
-                self.run_timer();
+                self.run_timer(at, timer);
             }
         }
         let next = self.state.scheduler.timers.next();
@@ -286,9 +286,9 @@ impl Mcu {
         self.state.scheduler.is_behind
     }
 
+    /// Runs the next timer, which is this one.
     #[inline(always)]
-    pub(super) fn run_timer(&mut self) {
-        let Some((at, timer)) = self.state.scheduler.timers.first() else { return };
+    pub(super) fn run_timer(&mut self, at: Clock, timer: TimerId) {
         self.state.scheduler.take(at, timer);
         let oid = timer.oid();
         let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };

@@ -7,7 +7,6 @@ use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::sync::{LazyLock, OnceLock};
-use std::thread;
 
 use nix::fcntl::OFlag;
 use nix::unistd::getegid;
