@@ -580,7 +580,7 @@ struct Core {
 fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> Core {
     let scheduling = realtime::enter(Role::Core);
     let processors = Processors::new(None).expect("the processors");
-    let mut waiter = Waiter::new(Arc::new(clock), MarginLimits::default(), scheduling, processors);
+    let mut waiter = Waiter::new(Arc::new(clock), Arc::default(), MarginLimits::default(), scheduling, processors);
     let mut core = Core { steps: Lateness::default(), bits: Lateness::default(), messages: [0; 2] };
     let mut good = true;
     let start = clock.now() + Ticks::from_ms(1);
@@ -590,14 +590,15 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     timers.extend(with_bits.then_some((start, BIT, true)));
     while !end.load(Ordering::Relaxed) {
         let Some((at, every, is_bit)) = timers.iter_mut().min_by_key(|(at, ..)| *at) else { break };
-        if clock.now() < *at {
-            waiter.wait(*at, Some(*at), |_| false);
+        let begin = clock.now();
+        if begin < *at {
+            waiter.wait(begin, *at, Some(*at), |_| false);
         }
         let now = clock.now();
-        let late = now.since(*at);
+        let late = Ticks::between(*at, now);
         if *is_bit {
             core.bits.record(late);
-            good &= late < i64::from(BIT.0 / 2);
+            good &= late.0 < BIT.0 / 2;
             if core.bits.samples().is_multiple_of(120) {
                 core.messages = [core.messages[0] + 1, core.messages[1] + u64::from(good)];
                 good = true;

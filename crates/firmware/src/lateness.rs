@@ -17,13 +17,12 @@ const BUCKETS: usize = 30 * PARTS + PARTS;
 #[derive(Clone, Debug)]
 pub struct Lateness {
     counts: [u64; BUCKETS],
-    samples: u64,
     max: u32,
 }
 
 impl Default for Lateness {
     fn default() -> Lateness {
-        Lateness { counts: [0; BUCKETS], samples: 0, max: 0 }
+        Lateness { counts: [0; BUCKETS], max: 0 }
     }
 }
 
@@ -48,18 +47,18 @@ fn upper(bucket: usize) -> u32 {
 }
 
 impl Lateness {
-    /// Records a sample in ticks. An early sample, below zero, counts as not late.
+    /// Records a sample.
     #[inline]
-    pub fn record(&mut self, late: i64) {
-        let late = late.clamp(0, i64::from(u32::MAX)) as u32;
+    pub fn record(&mut self, Ticks(late): Ticks) {
         self.counts[bucket(late)] += 1;
-        self.samples += 1;
-        self.max = self.max.max(late);
+        if late > self.max {
+            self.max = late;
+        }
     }
 
     /// How many samples there are.
     pub fn samples(&self) -> u64 {
-        self.samples
+        self.counts.iter().sum()
     }
 
     /// The longest delay.
@@ -70,7 +69,7 @@ impl Lateness {
     /// The longest delay of the best share `q` (0 to 1) of the samples. It is up to an eighth too high, because it is
     /// the upper end of a bucket.
     pub fn quantile(&self, q: f64) -> Ticks {
-        let wanted = (q * self.samples as f64).ceil() as u64;
+        let wanted = (q * self.samples() as f64).ceil() as u64;
         let mut seen = 0;
         for (bucket, count) in self.counts.iter().enumerate() {
             seen += count;
@@ -95,14 +94,14 @@ pub fn us(ticks: Ticks) -> f64 {
 
 impl fmt::Display for Lateness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.samples == 0 {
+        let samples = self.samples();
+        if samples == 0 {
             return f.write_str("no events");
         }
         let q = |q| us(self.quantile(q));
         write!(
             f,
-            "{} events, late by p50 {:.2} us, p99 {:.2} us, p99.9 {:.2} us, at most {:.2} us",
-            self.samples,
+            "{samples} events, late by p50 {:.2} us, p99 {:.2} us, p99.9 {:.2} us, at most {:.2} us",
             q(0.5),
             q(0.99),
             q(0.999),
@@ -131,9 +130,9 @@ mod tests {
     fn quantiles_of_a_known_distribution() {
         let mut lateness = Lateness::default();
         for late in 0..1000 {
-            lateness.record(late);
+            lateness.record(Ticks(late));
         }
-        lateness.record(-5);
+        lateness.record(Ticks(0));
         for (q, exact) in [(0.5, 500.0), (0.99, 990.0), (0.1, 100.0)] {
             let got = f64::from(lateness.quantile(q).0);
             assert!((exact - 1.0..exact * 1.125 + 1.0).contains(&got), "{q}: {got}");
@@ -145,7 +144,7 @@ mod tests {
     fn nothing_is_said_of_how_late_nothing_was() {
         let mut lateness = Lateness::default();
         assert_eq!(lateness.to_string(), "no events");
-        lateness.record(50);
+        lateness.record(Ticks(50));
         assert!(lateness.to_string().starts_with("1 events, late by p50 1.00 us"), "{lateness}");
     }
 }

@@ -30,6 +30,12 @@ impl Ticks {
         Ticks(ms * (CLOCK_FREQ / 1000))
     }
 
+    /// The span between two times: zero if `to` is before `from`, and [`u32::MAX`] if it is longer.
+    #[inline]
+    pub fn between(from: Clock, to: Clock) -> Ticks {
+        Ticks(u32::try_from(to.to_bits().saturating_sub(from.to_bits())).unwrap_or(u32::MAX))
+    }
+
     /// The span in whole milliseconds.
     pub const fn as_ms(self) -> u32 {
         self.0 / Ticks::from_ms(1).0

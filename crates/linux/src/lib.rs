@@ -30,6 +30,7 @@ pub mod gpio;
 mod guard;
 pub mod i2c;
 pub mod own_folder;
+pub mod parker;
 pub mod pins;
 pub mod proc;
 pub mod pwm;

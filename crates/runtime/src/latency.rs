@@ -38,7 +38,7 @@ pub fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
     in_thread(move || {
         realtime::lock_memory();
         let scheduling = realtime::enter(Role::Core);
-        let new_waiter = |clock, limits| Waiter::new(clock, limits, scheduling, processors);
+        let new_waiter = |clock, limits| Waiter::new(clock, Arc::default(), limits, scheduling, processors);
         let idle = measure("idle", span, new_waiter);
         let load = Load::start();
         let loaded = measure("under load", span, new_waiter);
@@ -55,9 +55,10 @@ fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
         let scheduling = realtime::enter(Role::Worker);
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
         let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
-        let bare = MarginLimits { min: Ticks(0), max: Ticks(0) };
+        let bare = MarginLimits::always(Ticks(0));
         let mut wakeup = Lateness::default();
-        let margin = run_for(&clock, Waiter::new(clock.clone(), bare, scheduling, processors), end, &mut wakeup);
+        let margin =
+            run_for(&clock, Waiter::new(clock.clone(), Arc::default(), bare, scheduling, processors), end, &mut wakeup);
         (scheduling, Half { name: "beside Pinion", edge: wakeup.clone(), wakeup, margin })
     })
 }
@@ -92,7 +93,7 @@ fn measure(
     let mut half = Half { name, wakeup: Lateness::default(), edge: Lateness::default(), margin: Ticks(0) };
     // Bare sleeps for a quarter of the time, then the program's own waiting.
     let bare_end = clock.now().ticks() + (span.as_nanos() / 80) as u64;
-    let bare = MarginLimits { min: Ticks(0), max: Ticks(0) };
+    let bare = MarginLimits::always(Ticks(0));
     run_for(&clock, new_waiter(clock.clone(), bare), bare_end, &mut half.wakeup);
     half.margin = run_for(&clock, new_waiter(clock.clone(), MarginLimits::default()), end, &mut half.edge);
     half
@@ -101,9 +102,9 @@ fn measure(
 fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: &mut Lateness) -> Ticks {
     let mut at = clock.now() + PERIOD;
     while at < Clock::from_ticks(end) {
-        waiter.wait(at, Some(at), |_| false);
+        waiter.wait(clock.now(), at, Some(at), |_| false);
         let now = clock.now();
-        lateness.record(now.since(at));
+        lateness.record(Ticks::between(at, now));
         at = at + PERIOD;
         if at < now {
             at = now + PERIOD;
@@ -236,9 +237,9 @@ mod tests {
     use super::*;
 
     /// A half in which the events were this late, in ticks.
-    fn half(name: &'static str, late: &[i64]) -> Half {
+    fn half(name: &'static str, late: &[u32]) -> Half {
         let mut edge = Lateness::default();
-        late.iter().for_each(|late| edge.record(*late));
+        late.iter().for_each(|late| edge.record(Ticks(*late)));
         Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
     }
 
@@ -254,7 +255,7 @@ mod tests {
     #[test]
     fn the_verdict_follows_the_worse_half() {
         let judged =
-            |loaded: &[i64]| judge(&[half("idle", &[1; 1000]), half("under load", loaded)], Scheduling::RealTime);
+            |loaded: &[u32]| judge(&[half("idle", &[1; 1000]), half("under load", loaded)], Scheduling::RealTime);
         assert_eq!(judged(&[1; 1000]).fitness, Fitness::Steppers);
         assert_eq!(judged(&[40_000; 1000]).fitness, Fitness::SlowOutputs);
         let verdict = judged(&[5_000_000; 1000]);

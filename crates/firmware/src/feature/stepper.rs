@@ -96,11 +96,17 @@ impl Intervals {
     /// Takes the next interval, in ticks.
     #[inline]
     fn next(&mut self) -> u32 {
+        let ticks = if self.shift == 0 { self.interval } else { self.whole_ticks() };
+        self.interval = self.interval.wrapping_add_signed(self.add);
+        self.add = self.add.wrapping_add(self.add2);
+        ticks
+    }
+
+    /// The whole ticks of the next interval. Keeps the rest.
+    fn whole_ticks(&mut self) -> u32 {
         let units = self.interval.wrapping_add(u32::from(self.left));
         let ticks = units >> self.shift;
         self.left = (units - (ticks << self.shift)) as u16;
-        self.interval = self.interval.wrapping_add_signed(self.add);
-        self.add = self.add.wrapping_add(self.add2);
         ticks
     }
 }
@@ -149,6 +155,9 @@ const POSITION_BIAS: u32 = 0x4000_0000;
 
 impl Stepper {
     /// Takes the next move. `earliest` is the earliest time of its first edge. `None`: the stepper is idle.
+    ///
+    /// It is not inlined, so that the edges before the last one of a move need not save registers for it.
+    #[inline(never)]
     fn load(&mut self, context: &mut Context, earliest: Option<Clock>) -> Result<Next, Shutdown> {
         let Some(item) = self.queue.pop(context.moves()) else {
             self.edges = 0;
@@ -222,6 +231,7 @@ impl Stepper {
     }
 
     /// Changes the direction. The next step waits for the setup time.
+    #[inline(never)]
     fn reverse(&mut self, context: &mut Context) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         self.dir.flush();

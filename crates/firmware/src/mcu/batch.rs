@@ -44,14 +44,12 @@ impl Mcu {
     /// Runs the next timer and the others of its instant, as far as each begins with an edge on the same bank. No
     /// command runs between them.
     #[inline(never)]
-    pub(super) fn run_batch(&mut self) {
-        let Some(at) = self.next_timer() else { return };
+    pub(super) fn run_batch(&mut self, at: Clock) {
         let mut batch = Batch { now: self.last_read(), bank: None, high: 0, low: 0 };
         let State { scheduler, objects, .. } = &mut self.state;
-        let joining = scheduler.of_instant(at).take_while(|timer| {
-            let object = timer.oid().and_then(|oid| objects.get_mut(oid));
-            object.is_some_and(|object| object.join(&mut batch))
-        });
+        let joining = scheduler
+            .of_instant(at)
+            .take_while(|timer| objects.get_mut(timer.oid()).is_some_and(|object| object.join(&mut batch)));
         let count = joining.count();
         if let Some(bank) = batch.bank {
             bank.change(batch.high, batch.low);
@@ -61,10 +59,8 @@ impl Mcu {
         }
         for _ in 0..count.max(1) {
             // A failure removes the other timers.
-            if self.next_timer() != Some(at) {
-                break;
-            }
-            self.run_timer();
+            let Some(timer) = self.state.scheduler.of_instant(at).next() else { break };
+            self.run_timer(at, timer);
         }
     }
 }

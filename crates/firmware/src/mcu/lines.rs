@@ -148,8 +148,13 @@ impl Level {
     fn begin(&self, direction: Direction) {
         match direction {
             Direction::Output { level, .. } => self.set(level),
-            _ => self.0.store(UNKNOWN, Ordering::Relaxed),
+            _ => self.forget(),
         }
+    }
+
+    /// Nothing is known of it from now on.
+    pub(super) fn forget(&self) {
+        self.0.store(UNKNOWN, Ordering::Relaxed);
     }
 
     #[inline]
@@ -171,17 +176,19 @@ impl Level {
     }
 }
 
-/// A line whose edges are recorded. It compares with the level before its user stores the new one.
+/// A line whose edges are recorded.
 struct Recorded {
     line: Arc<dyn Line>,
     pin: Pin,
-    level: Arc<Level>,
+    /// The last recorded level.
+    level: Level,
     recorder: Arc<dyn EdgeRecorder>,
 }
 
 impl Recorded {
     fn is_now(&self, level: bool) {
         if self.level.get() != Some(level) {
+            self.level.set(level);
             self.recorder.edge(self.pin, level);
         }
     }
@@ -191,7 +198,7 @@ impl Recorded {
             Direction::Output { level, .. } => self.is_now(level),
             Direction::OpenDrain => self.is_now(true),
             // Somebody else sets its level.
-            Direction::Input(_) => {}
+            Direction::Input(_) => self.level.begin(direction),
         }
     }
 }
@@ -320,7 +327,7 @@ impl State {
                 None => line,
                 Some(recorder) => {
                     recorder.claimed(pin, pin.name_in(&self.board.pins()));
-                    let recorded = Recorded { line, pin, level: level.clone(), recorder: recorder.clone() };
+                    let recorded = Recorded { line, pin, level: Level::unknown(), recorder: recorder.clone() };
                     recorded.turned(direction);
                     Arc::new(recorded)
                 }

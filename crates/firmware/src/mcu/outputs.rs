@@ -96,9 +96,9 @@ impl PromptLine {
     /// "GPIO line write failed".
     #[inline]
     pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
-        self.line.write(level)?;
+        // Stored before the call, so that nothing has to be kept through it.
         self.level.set(level);
-        Ok(())
+        self.line.write(level).inspect_err(|_| self.level.forget())
     }
 
     /// Inverts the line.

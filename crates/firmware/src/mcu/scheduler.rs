@@ -11,7 +11,7 @@ use crate::time::{Clock, Ticks, TimeSource, Timing};
 
 use super::stats::Stats;
 use super::timers::Timers;
-use super::{Context, Mcu, Next, Note, OBJECTS_MAX, Oid, TimerId, WireClock, base};
+use super::{Context, Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
 
 /// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
@@ -202,20 +202,17 @@ impl Scheduler {
         self.timing.step_late_limit
     }
 
-    /// Takes the next timer, and records how late it is.
+    /// Takes the next timer, which is this one, and records how late it is.
     #[inline(always)]
-    fn take_due(&mut self) -> Option<(Clock, TimerId)> {
-        let (at, timer) = self.timers.pop()?;
+    fn take(&mut self, at: Clock, timer: TimerId) {
+        self.timers.pop();
         if timer.is_exact() {
-            let late = self.last_read.since(at);
+            let late = Ticks::between(at, self.last_read);
             self.lateness.record(late);
-            if late > i64::from(self.latest.late.0) {
-                let late = Ticks(u32::try_from(late).unwrap_or(u32::MAX));
-                let oid = timer.oid().and_then(Oid::number);
-                self.latest = Latest { late, oid };
+            if late > self.latest.late {
+                self.latest = Latest { late, oid: timer.oid().number() };
             }
         }
-        Some((at, timer))
     }
 }
 
@@ -258,21 +255,18 @@ impl Mcu {
     /// MCU stops. A batch counts as one timer.
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.state.scheduler.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
-            if self
-                .state
-                .scheduler
-                .timers
-                .next()
-                .is_none_or(|at| at > self.state.scheduler.last_read && at > self.now())
-            {
-                self.state.scheduler.is_behind = false;
+            let scheduler = &mut self.state.scheduler;
+            let Some((at, timer)) =
+                scheduler.timers.first().filter(|(at, _)| *at <= scheduler.last_read || *at <= scheduler.now())
+            else {
+                scheduler.is_behind = false;
                 return false;
-            }
+            };
             // Almost all timers are alone.
-            if self.state.scheduler.has_banks && self.state.scheduler.timers.has_several_next() {
-                self.run_batch();
+            if scheduler.has_banks && scheduler.timers.has_several_next() {
+                self.run_batch(at);
             } else {
-                self.run_timer();
+                self.run_timer(at, timer);
             }
         }
         let next = self.state.scheduler.timers.next();
@@ -292,20 +286,21 @@ impl Mcu {
         self.state.scheduler.is_behind
     }
 
+    /// Runs the next timer, which is this one.
     #[inline(always)]
-    pub(super) fn run_timer(&mut self) {
-        let Some((at, timer)) = self.state.scheduler.take_due() else { return };
-        let Some(oid) = timer.oid() else { return self.run_own_timer(timer, at) };
-        let Some(mut object) = self.state.objects.take(oid) else { return };
+    pub(super) fn run_timer(&mut self, at: Clock, timer: TimerId) {
+        self.state.scheduler.take(at, timer);
+        let oid = timer.oid();
+        let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };
         self.state.scheduler.timing.due.set(Some(at));
         let result = object.event(&mut Context::new(&mut self.state, oid), timer.timer(), at);
         self.state.scheduler.timing.due.set(None);
         match result {
             Ok(next) => {
-                self.state.objects.put_back(oid, object);
                 if let Next::At(at) = next {
                     self.state.scheduler.timers.insert(at, timer);
                 }
+                self.state.objects.put_back(oid, object);
             }
             Err(stop) => {
                 let stop = self.state.blame(stop, object.kind(), oid);
@@ -321,7 +316,9 @@ impl Mcu {
         match timer {
             TimerId::RETRY => self.state.retry(),
             TimerId::HOLD => self.held_too_long(),
-            _ => self.send_stats(at),
+            TimerId::STATS => self.send_stats(at),
+            // The timer of an object that is gone.
+            _ => {}
         }
         self.state.scheduler.timing.due.set(None);
     }

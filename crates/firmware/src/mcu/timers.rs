@@ -3,35 +3,39 @@
 
 #![forbid(unsafe_code)]
 
+use std::mem;
+
 use crate::time::Clock;
 
 use super::Oid;
 
 /// A timer of an object. The timers of an object have different numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Timer {
-    number: u8,
-    is_exact: bool,
-}
+pub struct Timer(u8);
 
 impl Timer {
-    /// A timer that finds the core awake when it is due.
+    /// Set in an exact timer, next to the number.
+    const EXACT: u8 = 1 << 7;
+
+    /// A timer that finds the core awake when it is due. Numbers are below 128.
     pub const fn exact(number: u8) -> Timer {
-        Timer { number, is_exact: true }
+        debug_assert!(number < Timer::EXACT);
+        Timer(number | Timer::EXACT)
     }
 
     /// A timer that may be late by the time of a wake-up, because it takes samples at a steady pace. The core sleeps
     /// until it is due. Before an exact timer the core wakes earlier and spins.
     pub const fn sampling(number: u8) -> Timer {
-        Timer { number, is_exact: false }
+        debug_assert!(number < Timer::EXACT);
+        Timer(number)
     }
 }
 
 /// Identifies a timer of an object, or the MCU's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct TimerId {
-    /// The object; `None` for the MCU's own timers.
-    oid: Option<Oid>,
+    /// The object; [`Oid::NONE`] for the MCU's own timers.
+    oid: Oid,
     timer: Timer,
 }
 
@@ -45,21 +49,21 @@ impl TimerId {
     pub(super) const HOLD: TimerId = TimerId::own(2);
 
     const fn own(number: u8) -> TimerId {
-        TimerId { oid: None, timer: Timer::sampling(number) }
+        TimerId { oid: Oid::NONE, timer: Timer::sampling(number) }
     }
 
     /// A timer of an object.
     pub(super) const fn of(oid: Oid, timer: Timer) -> TimerId {
-        TimerId { oid: Some(oid), timer }
+        TimerId { oid, timer }
     }
 
     /// Whether the core must be awake when it is due.
     pub(super) const fn is_exact(self) -> bool {
-        self.timer.is_exact
+        self.timer.0 & Timer::EXACT != 0
     }
 
-    /// The object whose timer it is.
-    pub(super) const fn oid(self) -> Option<Oid> {
+    /// The object whose timer it is; [`Oid::NONE`] for the MCU's own timers.
+    pub(super) const fn oid(self) -> Oid {
         self.oid
     }
 
@@ -109,9 +113,16 @@ impl Timers {
         self.waiting.iter().rev().take_while(move |(of, _)| *of == at).map(|(_, timer)| *timer)
     }
 
+    /// The next timer and its due time.
     #[inline]
-    pub(super) fn pop(&mut self) -> Option<(Clock, TimerId)> {
-        self.waiting.pop()
+    pub(super) fn first(&self) -> Option<(Clock, TimerId)> {
+        self.waiting.last().copied()
+    }
+
+    /// Takes the next timer.
+    #[inline]
+    pub(super) fn pop(&mut self) {
+        self.waiting.pop();
     }
 
     /// Inserts a timer after those with the same due time. A timer is in the queue at most once. So there are never
@@ -122,11 +133,12 @@ impl Timers {
         let mut place = self.waiting.len();
         self.waiting.push((at, timer));
         // Its place is usually near the end, so moving entries one by one is faster than memmove.
-        while place > 0 && self.waiting[place - 1].0 <= at {
-            self.waiting[place] = self.waiting[place - 1];
+        while let Some([before, own]) = self.waiting.get_mut(place.wrapping_sub(1)..=place)
+            && before.0 <= at
+        {
+            mem::swap(before, own);
             place -= 1;
         }
-        self.waiting[place] = (at, timer);
     }
 
     pub(super) fn remove(&mut self, timer: TimerId) {
@@ -135,7 +147,7 @@ impl Timers {
 
     /// Removes the timers of objects.
     pub(super) fn clear(&mut self) {
-        self.waiting.retain(|(_, timer)| timer.oid.is_none());
+        self.waiting.retain(|(_, timer)| timer.oid == Oid::NONE);
     }
 }
 
@@ -157,7 +169,7 @@ mod tests {
                 timers.insert(*at, *timer);
             }
             expected.sort_by_key(|(at, _)| *at);
-            let got: Vec<_> = std::iter::from_fn(|| timers.pop()).collect();
+            let got: Vec<_> = std::iter::from_fn(|| timers.first().inspect(|_| timers.pop())).collect();
             prop_assert_eq!(got, expected);
         }
     }

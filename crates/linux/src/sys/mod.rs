@@ -7,9 +7,10 @@ use std::io::{self, IoSliceMut};
 use std::num::NonZeroUsize;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::ptr::NonNull;
+use std::ptr::{self, NonNull};
 use std::slice;
 use std::sync::atomic::{AtomicU32, AtomicU64};
+use std::time::Duration;
 
 use nix::cmsg_space;
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
@@ -41,6 +42,30 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }
+}
+
+// The kernel's `struct timespec` of SYS_futex has two longs.
+const _: () = assert!(size_of::<libc::timespec>() == 2 * size_of::<libc::c_long>());
+
+/// Sleeps while `word` is `value`, until `end` (CLOCK_MONOTONIC) at most. It may end early.
+pub fn futex_wait_until(word: &AtomicU32, value: u32, end: Duration) {
+    let end = libc::timespec {
+        tv_sec: end.as_secs().try_into().unwrap_or(libc::time_t::MAX),
+        // It is below 10^9.
+        tv_nsec: end.subsec_nanos() as libc::c_long,
+    };
+    // Unlike FUTEX_WAIT, it takes a time and not a span.
+    let operation = libc::FUTEX_WAIT_BITSET | libc::FUTEX_PRIVATE_FLAG;
+    let (other, any) = (ptr::null::<u32>(), u32::MAX);
+    // SAFETY: the call reads `word` and `end`, which live through it.
+    unsafe { libc::syscall(libc::SYS_futex, word.as_ptr(), operation, value, &end, other, any) };
+}
+
+/// Wakes a thread that sleeps in [`futex_wait_until`] with this word.
+pub fn futex_wake(word: &AtomicU32) {
+    let operation = libc::FUTEX_WAKE | libc::FUTEX_PRIVATE_FLAG;
+    // SAFETY: the call takes the address only as a name.
+    unsafe { libc::syscall(libc::SYS_futex, word.as_ptr(), operation, 1) };
 }
 
 /// Gives the calling thread a nice value (-20 to 19). It counts while the thread is SCHED_OTHER (setpriority(2), "C

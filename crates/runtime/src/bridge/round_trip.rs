@@ -9,7 +9,7 @@ use std::fmt;
 use std::time::Duration;
 
 use pinion_firmware::lateness::{Lateness, us};
-use pinion_firmware::time::CLOCK_FREQ;
+use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::{Found, Resync, Sequence};
 
 /// Highest number of blocks without an acknowledgement. The host sends at most 12.
@@ -46,7 +46,7 @@ impl RoundTrips {
             let Some(last) = sent.iter().position(|(sequence, _)| sequence.next() == expected) else { return };
             if let Some((_, at)) = sent.drain(..=last).next_back() {
                 let ticks = now.saturating_sub(at).as_secs_f64() * f64::from(CLOCK_FREQ);
-                times.record(ticks as i64);
+                times.record(Ticks(ticks as u32));
             }
         });
     }

@@ -19,7 +19,7 @@ use rtrb::Consumer;
 
 use pinion_firmware::mcu::{Dialect, Mcu, base};
 use pinion_firmware::shutdown::{Shutdown, reason};
-use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 use pinion_linux::clock::monotonic;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::vlq::Reader;
@@ -93,7 +93,6 @@ const LAST_WRITES: Duration = Duration::from_millis(1500);
 
 pub(crate) struct Core {
     mcu: Mcu,
-    clock: Arc<dyn TimeSource>,
     requests: Consumer<Request>,
     waiter: Waiter,
     heartbeat: Heartbeat,
@@ -116,7 +115,6 @@ pub(crate) struct Core {
 /// The parts of the core.
 pub(crate) struct Parts {
     pub(crate) mcu: Mcu,
-    pub(crate) clock: Arc<dyn TimeSource>,
     pub(crate) requests: Consumer<Request>,
     pub(crate) waiter: Waiter,
     pub(crate) heartbeat: Heartbeat,
@@ -146,13 +144,11 @@ pub(crate) enum Left {
 
 impl Core {
     pub(crate) fn new(parts: Parts) -> Core {
-        let Parts { mcu, clock, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll } =
-            parts;
+        let Parts { mcu, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll } = parts;
         Core {
             untold: false,
-            polling: PollBudget::new(may_poll, clock.now()),
+            polling: PollBudget::new(may_poll, mcu.last_read()),
             mcu,
-            clock,
             requests,
             waiter,
             heartbeat,
@@ -170,7 +166,7 @@ impl Core {
     /// Runs until it is asked to quit.
     pub(crate) fn run(mut self) -> Left {
         self.trace_writer.start();
-        let mut busy_since = self.clock.now();
+        let mut busy_since = self.mcu.now();
         let mut was_shutdown = false;
         loop {
             if self.mcu.is_shutdown() != was_shutdown {
@@ -211,7 +207,8 @@ impl Core {
                 }
             }
             let deadline = self.mcu.next_timer();
-            let now = self.mcu.now();
+            // The timers have just read it, if none is due.
+            let now = self.mcu.last_read();
             if deadline.is_some_and(|deadline| deadline <= now) {
                 self.yielded += 1;
                 continue;
@@ -237,34 +234,31 @@ impl Core {
             let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
             let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
                 // Sleep half the way: this leaves room for a late wake-up.
-                self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
-                busy_since = self.clock.now();
+                busy_since = self.nap(now, now + Ticks(FAR_TICKS.min(to_go / 2) as u32));
                 continue;
             };
             let exact = self.mcu.next_exact_timer();
             let Core { waiter, progress, stops_taken, mcu, block, requests, .. } = &mut self;
             let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
             // Near a timer, calls have to wait.
-            busy_since = match waiter.wait(deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
+            busy_since = match waiter.wait(now, deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
                 // The edge must not wait for another look at the clock.
                 Woken::Due(now) => {
                     self.mcu.saw(now);
                     self.yielded += 1;
                     now
                 }
-                Woken::Called => self.clock.now(),
+                Woken::Called(now) => now,
             };
         }
     }
 
     /// Sleeps while no timer is due, or until the core is woken, so that the heartbeat continues. Unlike the wait for a
-    /// timer, it ends without spinning.
-    fn nap(&mut self, longest: Duration) {
+    /// timer, it ends without spinning. Returns the time now.
+    fn nap(&mut self, now: Clock, end: Clock) -> Clock {
         let Core { progress, stops_taken, mcu, block, requests, .. } = &*self;
         let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
-        if !calls.any() {
-            self.waiter.nap(longest);
-        }
+        if calls.any() { now } else { self.waiter.nap(now, end) }
     }
 
     /// Records the last sleep, and what has changed. The core does this when no timer is due: before it polls or sleeps.
@@ -299,7 +293,7 @@ impl Core {
             self.mcu.run_workers();
             self.tell_pending();
             self.heartbeat.beat(self.mcu.now(), false);
-            thread::park_timeout(Duration::from_millis(1));
+            thread::sleep(Duration::from_millis(1));
         }
         let left = self.mcu.pending_value().map_or(Left::Safe, |pending| Left::Pending(pending.to_owned()));
         // This beat gives workers and devices time to end.
@@ -499,8 +493,9 @@ mod tests {
     use crate::process::realtime::{Processors, Scheduling};
     use crate::status;
     use pinion_firmware::mcu::{DialectName, Note, Outbox};
-    use pinion_firmware::time::{Timing, VirtualClock};
+    use pinion_firmware::time::{TimeSource, Timing, VirtualClock};
     use pinion_linux::clock::Monotonic;
+    use pinion_linux::parker::Parker;
     use pinion_protocol::vlq::Writer;
     use pinion_testbench::board::{Bench, FakeBoard};
 
@@ -535,6 +530,7 @@ mod tests {
     /// A working core with an SPI device and a digital output, and a stand-in for its link.
     struct Rig {
         thread: JoinHandle<Left>,
+        parker: Arc<Parker>,
         dialect: Arc<Dialect>,
         clock: Arc<Counting>,
         requests: Producer<Request>,
@@ -561,12 +557,14 @@ mod tests {
             let core_clock: Arc<dyn TimeSource> = clock.clone();
             let wake = Arc::new(LinkWake::new().unwrap());
             let core_wake = wake.clone();
+            let parker = Arc::new(Parker::default());
+            let core_parker = parker.clone();
             let thread = thread::spawn(move || {
                 let heartbeat = Heartbeat::new(monotonic).unwrap();
                 let recording = Recording::of_a_test();
                 let (_recorder, trace_writer) = Recorder::new(recording.clone()).unwrap();
                 let workers =
-                    Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), heartbeat, recording, true);
+                    Threads::new(core_parker.clone(), Arc::new(|| ()), core_clock.clone(), heartbeat, recording, true);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -575,27 +573,16 @@ mod tests {
                     Box::new(core_heard),
                 );
                 let early = Ticks::from_us(200);
-                let (limits, processors) = (MarginLimits { min: early, max: early }, Processors::new(None).unwrap());
-                let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
-                let (clock, progress, wake) = (core_clock, core_progress, core_wake);
+                let (limits, processors) = (MarginLimits::always(early), Processors::new(None).unwrap());
+                let waiter = Waiter::new(core_clock, core_parker, limits, Scheduling::Ordinary, processors);
+                let (progress, wake) = (core_progress, core_wake);
                 let snapshots = status::ends().0;
                 let may_poll = true;
                 let requests = inbox;
-                Core::new(Parts {
-                    mcu,
-                    clock,
-                    requests,
-                    waiter,
-                    heartbeat,
-                    progress,
-                    wake,
-                    snapshots,
-                    trace_writer,
-                    may_poll,
-                })
-                .run()
+                Core::new(Parts { mcu, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll })
+                    .run()
             });
-            let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
+            let mut rig = Rig { thread, parker, dialect, clock, requests, progress, wake, heard, bench };
             rig.run("allocate_oids count=%c", &[3]);
             rig.run("config_spi_without_cs oid=%c", &[0]);
             rig.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
@@ -635,7 +622,7 @@ mod tests {
 
         fn request(&mut self, request: Request) {
             self.requests.push(request).ok().unwrap();
-            self.thread.thread().unpark();
+            self.parker.unpark();
         }
 
         /// Asks for a stop as the link does.

@@ -13,6 +13,7 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, EdgeRecorder, Mcu};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
+use pinion_linux::parker::Parker;
 use pinion_sync::progress::Progress;
 
 use crate::core::heartbeat::Heartbeat;
@@ -56,7 +57,8 @@ impl CoreThread {
         let (requests, inbox) = RingBuffer::new(REQUESTS);
         // Count the processors before the core is confined to one.
         let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
-        let core_progress = progress.clone();
+        let parker = Arc::new(Parker::default());
+        let (core_progress, core_parker) = (progress.clone(), parker.clone());
         let core = started(thread::Builder::new().name("core".into()).spawn(move || {
             let CoreThread {
                 board,
@@ -86,27 +88,15 @@ impl CoreThread {
                 }
             });
             let clock = timing.clock.clone();
-            let workers = Threads::new(thread::current(), prepare, clock.clone(), heartbeat, recording, may_poll);
+            let workers = Threads::new(core_parker.clone(), prepare, clock.clone(), heartbeat, recording, may_poll);
             let mut mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(response_ring));
             edges.into_iter().for_each(|edges| mcu.record_edges(edges));
-            let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
+            let waiter = Waiter::new(clock, core_parker, margin, scheduling, processors);
             let (requests, progress) = (inbox, core_progress);
-            Core::new(Parts {
-                mcu,
-                clock,
-                requests,
-                waiter,
-                heartbeat,
-                progress,
-                wake,
-                snapshots,
-                trace_writer,
-                may_poll,
-            })
-            .run()
+            Core::new(Parts { mcu, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll })
+                .run()
         }))?;
-        let thread = core.thread().clone();
         let ledger = Ledger::default();
-        Ok((core, CoreEnd { requests, thread, reader, progress, wake, ledger, may_poll }))
+        Ok((core, CoreEnd { requests, parker, reader, progress, wake, ledger, may_poll }))
     }
 }

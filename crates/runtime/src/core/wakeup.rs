@@ -9,12 +9,12 @@
 use std::hint;
 use std::path::Path;
 use std::sync::Arc;
-use std::thread;
 use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
-use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_linux::parker::Parker;
 
 use crate::core::budget::{Budget, Class, Throttle};
 use crate::process::realtime::{self, Processors, Scheduling};
@@ -25,6 +25,9 @@ use crate::recorder::Sleep;
 pub struct MarginLimits {
     /// Lowest margin. It keeps the margin alive when wake-ups are quick.
     pub min: Ticks,
+    /// Lowest margin while timers are [`CLOSE`] together. The core is awake for most of their time anyway, and one of
+    /// them that comes a little later costs less than to spin for each.
+    pub close: Ticks,
     /// Highest margin: the time that a wake-up of this computer may cost in spinning.
     pub max: Ticks,
 }
@@ -36,9 +39,15 @@ impl Default for MarginLimits {
 }
 
 impl MarginLimits {
-    /// Bounds of 5 and `us` microseconds. Both are `us` if that is less than 5.
+    /// Bounds of 5 (3 for close timers) and `us` microseconds. A bound that is longer than `us` is `us`.
     pub const fn up_to_us(us: u32) -> MarginLimits {
-        MarginLimits { min: Ticks::from_us(if us < 5 { us } else { 5 }), max: Ticks::from_us(us) }
+        let at_most = |most: u32| Ticks::from_us(if us < most { us } else { most });
+        MarginLimits { min: at_most(5), close: at_most(3), max: Ticks::from_us(us) }
+    }
+
+    /// These bounds, all the same.
+    pub const fn always(margin: Ticks) -> MarginLimits {
+        MarginLimits { min: margin, close: margin, max: margin }
     }
 }
 
@@ -50,8 +59,14 @@ pub struct Margin {
     fine: i64,
     /// Waits since the last wake-up that were too short to sleep.
     unslept: u32,
+    /// The last exact timer.
+    last_exact: Clock,
+    /// It was close to the one before it.
+    is_close: bool,
 }
 
+/// Exact timers at most this far apart are close together.
+const CLOSE: i64 = Ticks::from_us(10).0 as i64;
 /// After this many waits that were too short to sleep, a smaller margin is tried.
 const UNSLEPT_MAX: u32 = 500;
 /// Longest wait without a sleep. A shorter sleep is late by the time that going into it and out of it takes. It saves
@@ -61,21 +76,35 @@ const NAP_MIN: i64 = Ticks::from_us(1).0 as i64;
 const LATE_SHARE: i64 = 50;
 /// How many sleeps are tried at the start, and how long each is.
 const TRIALS: usize = 16;
-const TRIAL: Duration = Duration::from_micros(100);
+const TRIAL: Ticks = Ticks::from_us(100);
 const FINE: i64 = 256;
 
 impl Margin {
     /// A margin that covers a wake-up that comes `late` after its time, and a quarter more. It learns the rest from
     /// late edges.
     pub fn new(limits: MarginLimits, late: i64) -> Margin {
-        let mut margin = Margin { limits, fine: 0, unslept: 0 };
+        let mut margin = Margin { limits, fine: 0, unslept: 0, last_exact: Clock::EPOCH, is_close: false };
         margin.displace(late.clamp(0, i64::from(u32::MAX)) * FINE * 5 / 4);
         margin
     }
 
     /// How long before an instant to wake.
     pub fn get(&self) -> Ticks {
-        Ticks((self.fine / FINE) as u32)
+        Ticks((self.fine / FINE) as u32).max(self.floor())
+    }
+
+    /// The present lower bound.
+    fn floor(&self) -> Ticks {
+        if self.is_close { self.limits.close } else { self.limits.min }
+    }
+
+    /// The next wait is for this exact timer.
+    fn approach(&mut self, exact: Option<Clock>) {
+        // The core may wait for one timer several times.
+        if let Some(exact) = exact.filter(|exact| *exact != self.last_exact) {
+            self.is_close = exact.since(self.last_exact).abs() <= CLOSE;
+            self.last_exact = exact;
+        }
     }
 
     /// Learns from a wake-up that came `late` after its time. If the margin did not cover it, the margin grows by a
@@ -98,7 +127,7 @@ impl Margin {
 
     fn displace(&mut self, by: i64) {
         self.unslept = 0;
-        self.fine = (self.fine + by).clamp(i64::from(self.limits.min.0) * FINE, i64::from(self.limits.max.0) * FINE);
+        self.fine = (self.fine + by).clamp(i64::from(self.limits.close.0) * FINE, i64::from(self.limits.max.0) * FINE);
     }
 }
 
@@ -109,12 +138,12 @@ fn running_time() -> Duration {
 }
 
 /// How late the calling thread wakes from short sleeps: the second latest of a few. The latest may have another cause.
-fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
+fn try_wake_ups(clock: &dyn TimeSource, parker: &Parker) -> i64 {
     let mut late = [0; TRIALS];
     for late in &mut late {
-        let asleep = clock.now();
-        thread::park_timeout(TRIAL);
-        *late = clock.now().since(asleep) - (TRIAL.as_nanos() as u64 / NS_PER_TICK) as i64;
+        let wake_at = clock.now() + TRIAL;
+        parker.park_until(clock.duration_of(wake_at));
+        *late = clock.now().since(wake_at);
     }
     late.sort_unstable();
     late[TRIALS - 2]
@@ -125,13 +154,14 @@ fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
 pub enum Woken {
     /// The instant came. This is the time now.
     Due(Clock),
-    /// There is something else to do.
-    Called,
+    /// There is something else to do. This is the time now.
+    Called(Clock),
 }
 
 /// Waits as the core does.
 pub struct Waiter {
     clock: Arc<dyn TimeSource>,
+    parker: Arc<Parker>,
     margin: Margin,
     processors: Processors,
     scheduling: Scheduling,
@@ -142,10 +172,11 @@ pub struct Waiter {
 }
 
 impl Waiter {
-    /// A waiter for the calling thread, which has this `scheduling` and these `processors`. It sleeps a few times, two
-    /// milliseconds in all, to learn how late it wakes.
+    /// A waiter for the calling thread, which has this `scheduling` and these `processors`. Others wake it by `parker`.
+    /// It sleeps a few times, two milliseconds in all, to learn how late it wakes.
     pub fn new(
         clock: Arc<dyn TimeSource>,
+        parker: Arc<Parker>,
         limits: MarginLimits,
         scheduling: Scheduling,
         processors: Processors,
@@ -153,8 +184,8 @@ impl Waiter {
         let throttle =
             if scheduling == Scheduling::RealTime { Throttle::read(Path::new("/proc/sys/kernel")) } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
-        let margin = Margin::new(limits, try_wake_ups(&*clock));
-        Waiter { clock, margin, processors, scheduling, budget, sleep: None }
+        let margin = Margin::new(limits, try_wake_ups(&*clock, &parker));
+        Waiter { clock, parker, margin, processors, scheduling, budget, sleep: None }
     }
 
     /// The learned margin.
@@ -184,13 +215,17 @@ impl Waiter {
         }
     }
 
-    /// Sleeps for `span` or until the thread is unparked, without spinning.
-    pub fn nap(&mut self, span: Duration) {
-        let from = self.clock.now();
-        self.ran(from);
-        thread::park_timeout(span);
-        let until = from + Ticks(u32::try_from(span.as_nanos() / u128::from(NS_PER_TICK)).unwrap_or(u32::MAX));
-        self.sleep = Some(Sleep { from, to: self.clock.now(), until });
+    /// Sleeps from `now` until `end` or until the thread is unparked, without spinning. Returns the time now.
+    pub fn nap(&mut self, now: Clock, end: Clock) -> Clock {
+        self.ran(now);
+        self.sleep(now, end)
+    }
+
+    fn sleep(&mut self, from: Clock, until: Clock) -> Clock {
+        self.parker.park_until(self.clock.duration_of(until));
+        let to = self.clock.now();
+        self.sleep = Some(Sleep { from, to, until });
+        to
     }
 
     /// The last sleep, unless it was taken.
@@ -199,45 +234,47 @@ impl Waiter {
         self.sleep.take()
     }
 
-    /// Waits for `deadline`, or until `called` says that there is something to do. It is asked with the time now. A
-    /// thread that changes what `called` looks at unparks this thread. `exact` is the deadline or a later one. This thread sleeps until a margin before
-    /// `exact`, so that it is awake then. From there on it spins.
-    pub fn wait(&mut self, deadline: Clock, exact: Option<Clock>, mut called: impl FnMut(Clock) -> bool) -> Woken {
-        let mut now = self.clock.now();
-        let mut slept = deadline.since(now) < i64::from(self.margin.limits.min.0);
+    /// Waits for `deadline`, or until `called` says that there is something to do. `now` was read a short time ago.
+    /// `called` is asked with the time now. A thread that changes what `called` looks at unparks this thread. `exact` is
+    /// the deadline or a later one. This thread sleeps until a margin before `exact`, so that it is awake then. From
+    /// there on it spins.
+    pub fn wait(
+        &mut self,
+        mut now: Clock,
+        deadline: Clock,
+        exact: Option<Clock>,
+        mut called: impl FnMut(Clock) -> bool,
+    ) -> Woken {
+        self.margin.approach(exact);
+        let mut slept = deadline.since(now) < i64::from(self.margin.floor().0);
+        let mut spins = false;
         loop {
-            if called(now) {
-                return Woken::Called;
-            }
-            let wake_at = wake_at(deadline, exact, self.margin.get());
-            let asleep = wake_at.since(now);
-            if asleep <= NAP_MIN {
-                break;
-            }
-            slept = true;
-            self.ran(now);
-            let from = now;
-            thread::park_timeout(Duration::from_nanos(asleep as u64 * NS_PER_TICK));
-            now = self.clock.now();
-            self.sleep = Some(Sleep { from, to: now, until: wake_at });
-            let late = now.since(wake_at);
-            // A call woke the thread before its time. That says nothing about the margin.
-            if late >= 0 {
-                self.margin.learn(late);
-            }
-        }
-        if !slept {
-            self.margin.unslept();
-        }
-        loop {
-            let now = self.clock.now();
             if now >= deadline {
                 return Woken::Due(now);
             }
             if called(now) {
-                return Woken::Called;
+                return Woken::Called(now);
+            }
+            if !spins {
+                let wake_at = wake_at(deadline, exact, self.margin.get());
+                if wake_at.since(now) > NAP_MIN {
+                    slept = true;
+                    self.ran(now);
+                    now = self.sleep(now, wake_at);
+                    let late = now.since(wake_at);
+                    // A call woke the thread before its time. That says nothing about the margin.
+                    if late >= 0 {
+                        self.margin.learn(late);
+                    }
+                    continue;
+                }
+                spins = true;
+                if !slept {
+                    self.margin.unslept();
+                }
             }
             hint::spin_loop();
+            now = self.clock.now();
         }
     }
 }
@@ -280,6 +317,25 @@ mod tests {
     }
 
     #[test]
+    fn it_is_lower_before_a_timer_close_to_the_last_one() {
+        let limits = MarginLimits::default();
+        let mut margin = Margin::new(limits, 0);
+        let mut before = |us: u32| {
+            margin.approach(Some(Clock::EPOCH + Ticks::from_us(us)));
+            margin.get()
+        };
+        assert_eq!(before(1000), limits.min);
+        assert_eq!((before(1010), before(1003)), (limits.close, limits.close));
+        assert_eq!(before(1003), limits.close, "it is waited for again");
+        assert_eq!((before(1014), before(1014)), (limits.min, limits.min));
+        assert_eq!(before(1015), limits.close);
+        margin.approach(None);
+        assert_eq!(margin.get(), limits.close);
+        margin.learn(i64::from(limits.max.0));
+        assert!(margin.get() > limits.close, "late wake-ups still count");
+    }
+
+    #[test]
     fn a_margin_that_allows_no_sleep_shrinks() {
         let mut margin = Margin::new(MarginLimits::default(), 4000);
         let start = margin.get();
@@ -304,7 +360,7 @@ mod tests {
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
         let processors = Processors::new(None).unwrap();
         let limits = MarginLimits::default();
-        let mut waiter = Waiter::new(clock.clone(), limits, Scheduling::Ordinary, processors);
+        let mut waiter = Waiter::new(clock.clone(), Arc::default(), limits, Scheduling::Ordinary, processors);
         let meagre = Throttle { runtime_us: 100, period_us: 1_000_000 };
         waiter.budget = Some(Budget::new(meagre, clock.now(), running_time()));
         let before = sched_getaffinity(Pid::from_raw(0)).unwrap();
@@ -321,7 +377,8 @@ mod tests {
     fn a_thread_is_in_real_time_while_its_budget_lasts() {
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
         let processors = Processors::new(None).unwrap();
-        let mut waiter = Waiter::new(clock.clone(), MarginLimits::default(), Scheduling::Ordinary, processors);
+        let mut waiter =
+            Waiter::new(clock.clone(), Arc::default(), MarginLimits::default(), Scheduling::Ordinary, processors);
         assert!(!waiter.is_realtime());
         waiter.scheduling = Scheduling::RealTime;
         assert!(waiter.is_realtime());
@@ -336,23 +393,26 @@ mod tests {
     fn a_wait_ends_at_its_instant_or_by_a_call_with_the_time_now() {
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
         let processors = Processors::new(None).unwrap();
-        let mut waiter = Waiter::new(clock.clone(), MarginLimits::default(), Scheduling::Ordinary, processors);
+        let mut waiter =
+            Waiter::new(clock.clone(), Arc::default(), MarginLimits::default(), Scheduling::Ordinary, processors);
         let deadline = clock.now() + Ticks::from_ms(1);
-        let Woken::Due(now) = waiter.wait(deadline, Some(deadline), |_| false) else { panic!("nobody calls") };
+        let Woken::Due(now) = waiter.wait(clock.now(), deadline, Some(deadline), |_| false) else {
+            panic!("nobody calls")
+        };
         assert!(deadline <= now && now <= clock.now());
         let (begin, mut asked) = (clock.now(), Clock::EPOCH);
         let far = begin + Ticks::from_ms(10_000);
-        let woken = waiter.wait(far, Some(far), |now| {
+        let woken = waiter.wait(begin, far, Some(far), |now| {
             asked = now;
             true
         });
-        assert_eq!(woken, Woken::Called);
+        assert_eq!(woken, Woken::Called(asked));
         assert!(begin <= asked && asked < far);
     }
 
     #[test]
     fn the_margin_stays_within_its_bounds() {
-        let limits = MarginLimits { min: Ticks(50), max: Ticks(500) };
+        let limits = MarginLimits { min: Ticks(50), close: Ticks(30), max: Ticks(500) };
         let mut margin = Margin::new(limits, 100);
         for _ in 0..10_000 {
             margin.learn(1_000_000);

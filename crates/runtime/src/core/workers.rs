@@ -7,7 +7,7 @@
 use std::any::Any;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::{self, JoinHandle, Thread};
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use log::error;
@@ -18,6 +18,7 @@ use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{monotonic, wait_until};
+use pinion_linux::parker::Parker;
 
 use pinion_trace::event::Event;
 use pinion_trace::ring::Writer;
@@ -58,7 +59,7 @@ pub(crate) type Prepare = Arc<dyn Fn() + Send + Sync>;
 
 /// The workers of an MCU. Each one starts when the first device of its bus is opened.
 pub(crate) struct Threads {
-    core: Thread,
+    core: Arc<Parker>,
     prepare: Prepare,
     clock: Arc<dyn TimeSource>,
     heartbeat: Heartbeat,
@@ -71,7 +72,7 @@ impl Threads {
     /// No workers yet. A worker unparks `core` when a job is done, and notes in `heartbeat` since when it runs the
     /// job. It records its jobs in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(crate) fn new(
-        core: Thread,
+        core: Arc<Parker>,
         prepare: Prepare,
         clock: Arc<dyn TimeSource>,
         heartbeat: Heartbeat,
@@ -213,7 +214,7 @@ struct Server {
     devices: Devices,
     done: Producer<Finished>,
     quit: Arc<AtomicBool>,
-    core: Thread,
+    core: Arc<Parker>,
     clock: Arc<dyn TimeSource>,
     shown: JobClock,
     polling: PollBudget,
@@ -322,14 +323,8 @@ mod tests {
     fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
         let clock = Arc::new(Looks::default());
         let heartbeat = Heartbeat::new(Monotonic::start()).unwrap();
-        let mut threads = Threads::new(
-            thread::current(),
-            Arc::new(|| ()),
-            clock.clone(),
-            heartbeat,
-            Recording::of_a_test(),
-            may_poll,
-        );
+        let mut threads =
+            Threads::new(Arc::default(), Arc::new(|| ()), clock.clone(), heartbeat, Recording::of_a_test(), may_poll);
         let worker = threads.start("spi0").unwrap();
         // It reads the clock once when it falls asleep.
         let asleep = || {
@@ -363,7 +358,7 @@ mod tests {
         let clock = Monotonic::start();
         {
             let heartbeat = Heartbeat::new(clock).unwrap();
-            Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
+            Threads::new(Arc::default(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
         }
     }
 

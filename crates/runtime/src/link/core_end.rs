@@ -5,13 +5,14 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::thread::{self, Thread};
+use std::thread;
 use std::time::Duration;
 
 use log::log;
 use rtrb::{Producer, PushError};
 
 use pinion_linux::clock::monotonic;
+use pinion_linux::parker::Parker;
 use pinion_sync::progress::Progress;
 
 use crate::core::responses::{LinkWake, ResponseReader};
@@ -31,7 +32,8 @@ const REQUESTS_KEPT: usize = 8;
 /// The link's end of the core.
 pub(crate) struct CoreEnd {
     pub(crate) requests: Producer<Request>,
-    pub(crate) thread: Thread,
+    /// Wakes the core.
+    pub(crate) parker: Arc<Parker>,
     pub(crate) reader: ResponseReader,
     pub(crate) progress: Arc<Progress>,
     pub(crate) wake: Arc<LinkWake>,
@@ -56,10 +58,10 @@ impl CoreEnd {
         let mut request = request;
         while let Err(PushError::Full(back)) = self.requests.push(request) {
             request = back;
-            self.thread.unpark();
+            self.parker.unpark();
             thread::sleep(STALL);
         }
-        self.thread.unpark();
+        self.parker.unpark();
     }
 
     /// Whether there is room for another block.
@@ -91,7 +93,7 @@ impl CoreEnd {
     pub(crate) fn wake_for(&self, before: Handed) {
         let stops = self.progress.stops_handed() != before.stops;
         if self.has_more_since(before) && (stops || !self.progress.is_held()) {
-            self.thread.unpark();
+            self.parker.unpark();
         }
     }
 
@@ -147,8 +149,8 @@ mod tests {
         let (wake, progress) = (Arc::new(LinkWake::new().unwrap()), Arc::new(Progress::default()));
         let (mut response_ring, reader) = response_ring(wake.clone(), progress.clone());
         let (requests, _inbox) = RingBuffer::new(16);
-        let (thread, ledger) = (thread::current(), Ledger::default());
-        let mut end = CoreEnd { requests, thread, reader, progress: progress.clone(), wake, ledger, may_poll: false };
+        let (parker, ledger) = (Arc::default(), Ledger::default());
+        let mut end = CoreEnd { requests, parker, reader, progress: progress.clone(), wake, ledger, may_poll: false };
         assert!(!end.has_news());
         end.hand(Payload::new(b""), false);
         progress.begin();

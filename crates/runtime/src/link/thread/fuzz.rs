@@ -7,7 +7,6 @@ use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::sync::{LazyLock, OnceLock};
-use std::thread;
 
 use nix::fcntl::OFlag;
 use nix::unistd::getegid;
@@ -144,8 +143,8 @@ impl Bench {
         let (wake, progress) = (Arc::new(LinkWake::new().expect("an eventfd")), Arc::new(Progress::default()));
         let (response_ring, reader) = response_ring(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
-        let (thread, ledger) = (thread::current(), Ledger::default());
-        let end = CoreEnd { requests, thread, reader, progress: progress.clone(), wake, ledger, may_poll: false };
+        let (parker, ledger) = (Arc::default(), Ledger::default());
+        let end = CoreEnd { requests, parker, reader, progress: progress.clone(), wake, ledger, may_poll: false };
         let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *heartbeat);
         let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil).expect("epoll");
         let handshake = Handshake::of(dialect.clone());
