@@ -166,9 +166,9 @@ mod tests {
     use super::*;
     use pinion_firmware::time::Ticks;
 
-    fn half(name: &'static str, late: &[i64]) -> Half {
+    fn half(name: &'static str, late: &[u32]) -> Half {
         let mut edge = Lateness::default();
-        late.iter().for_each(|late| edge.record(*late));
+        late.iter().for_each(|late| edge.record(Ticks(*late)));
         Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
     }
 

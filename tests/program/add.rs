@@ -418,6 +418,66 @@ fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
     assert_eq!(card.read("root/kept"), "root's\n");
 }
 
+#[test]
+fn the_wires_are_those_of_the_board_s_settings() {
+    let card = Card::pi();
+    card.put("sys/bus/w1/devices/28-0316a4f1ff27/w1_slave", "");
+    card.put("boot/firmware/config.txt", "dtoverlay=w1-gpio,gpiopin=27\n");
+    let value: Value = serde_json::from_slice(&card.add(&["ds18b20", "--json", "--dry-run"]).stdout).unwrap();
+    assert_eq!(value["wires"][2]["pin"], 13, "{value}");
+    card.put("boot/firmware/config.txt", "dtoverlay=w1-gpio,gpiopin=40\n");
+    assert!(card.refused(&["ds18b20", "--yes"]).contains("w1-gpio is on line 40, which is not on the header"));
+    // All kernels of a Raspberry Pi 5 know this name of the line.
+    let card = Card::of("Raspberry Pi 5 Model B Rev 1.0", &[("boot/firmware/config.txt", CONFIG_TXT)]);
+    card.put(PRINTER, &format!("{PRINTER_CFG}[mcu]\nserial: /tmp/klipper_host_mcu\n[fan]\npin: GPIO17\n"));
+    assert!(card.added(&["relay", "--dry-run"]).contains("+ pin: mcu:pinctrl-rp1/gpio27"), "GPIO17 is taken");
+    // Up to the Raspberry Pi 3 the audio output has the channels of the hardware PWM.
+    let card = Card::of("Raspberry Pi 3 Model B Rev 1.2", &[("boot/firmware/config.txt", CONFIG_TXT)]);
+    let shown = card.added(&["fan", "--dry-run"]);
+    assert!(shown.contains("\n+ dtoverlay=pwm-2chan\n+ dtparam=audio=off\n"), "{shown}");
+}
+
+/// What editors of other systems leave.
+#[test]
+fn ends_of_lines_stay_as_they_are() {
+    for config_txt in ["dtparam=audio=on", "dtparam=audio=on\r\n[pi4]\r\nx=y", "dtparam=audio=on\r\n", "", "\n\n"] {
+        for printer_cfg in [PRINTER_CFG.replace('\n', "\r\n"), PRINTER_CFG.trim_end().to_owned(), String::new()] {
+            let card = Card::of("Raspberry Pi 4", &[("boot/firmware/config.txt", config_txt), (PRINTER, &printer_cfg)]);
+            let before = card.snapshot();
+            card.added(&["adxl345", "--yes"]);
+            for (path, old) in [("boot/firmware/config.txt", config_txt), (PRINTER, &*printer_cfg)] {
+                let text = card.read(path);
+                let (all, crlf) = (text.matches('\n').count(), text.matches("\r\n").count());
+                let has_crlf = old.contains("\r\n");
+                assert_eq!(crlf, if has_crlf { all } else { 0 }, "{text:?}");
+            }
+            assert!(card.read("boot/firmware/config.txt").lines().any(|line| line == "dtparam=spi=on"));
+            card.added(&["adxl345", "--yes", "--undo"]);
+            assert_eq!(card.snapshot(), before);
+        }
+    }
+}
+
+#[test]
+fn a_printer_cfg_that_may_not_be_changed_stays() {
+    let card = Card::pi();
+    fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o444)).unwrap();
+    let log = card.refused(&["relay", "--yes"]);
+    assert!(log.contains(&format!("/{PRINTER} is read-only: chmod u+w /{PRINTER}, then call this again")), "{log}");
+    assert_eq!(card.read(PRINTER), PRINTER_CFG);
+    assert!(!card.path(&PRINTER.replace("printer.cfg", "pinion")).exists());
+    fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o644)).unwrap();
+    card.added(&["relay", "--yes"]);
+    // Two users have a printer.
+    card.put("home/other/printer_data/config/printer.cfg", "[printer]\n");
+    let log = card.refused(&["light", "--yes"]);
+    assert!(log.contains("there are several hosts, with /home/other/printer_data/config/printer.cfg and"), "{log}");
+    card.added(&["light", "--yes", "--config", "/home/other/printer_data/config/printer.cfg"]);
+    assert!(
+        !card.read(PRINTER).contains("light") && card.path("home/other/printer_data/config/pinion/light.cfg").exists()
+    );
+}
+
 /// A write to a disk without room: the kernel refuses it.
 #[test]
 fn a_full_disk_leaves_the_old_files() {
@@ -472,7 +532,7 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
     let address = listener.local_addr().unwrap().to_string();
     let server = thread::spawn(move || {
         let mut requests = Vec::new();
-        let mut queried = false;
+        let (mut queried, mut is_warm) = (false, false);
         loop {
             let (mut stream, _) = listener.accept().unwrap();
             let mut request = Vec::new();
@@ -486,8 +546,15 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
                 "{\"result\":{\"status\":{\"fan_generic box\":{\"rpm\":1234.0}}}}".to_owned()
             } else if line.contains("objects/query") {
                 format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
-            } else if line.contains("printer/info") {
+            } else if line.contains("printer/info") && state != "error" {
                 "{\"result\":{\"state\":\"ready\"}}".to_owned()
+            } else if line.contains("temperature_sensor") {
+                // klippy says 0 until it has a value.
+                let degrees = if std::mem::replace(&mut is_warm, true) { "21.5" } else { "0.0" };
+                format!("{{\"result\":{{\"status\":{{\"temperature_sensor bme280\":{{\"temperature\":{degrees}}}}}}}}}")
+            } else if line.contains("printer/info") {
+                "{\"result\":{\"state\":\"error\",\"state_message\":\"mcu 'host': Unable to connect\\nmore\"}}"
+                    .to_owned()
             } else if line.contains("gcode_store") && queried {
                 "{\"result\":{\"gcode_store\":[{\"time\":2.0,\"type\":\"response\",\"message\":\
                  \"// accelerometer values (x, y, z): 470.0, 941.0, 9728.0\"}]}}"
@@ -555,6 +622,23 @@ fn a_fan_turns_until_its_tachometer_counts_and_leds_light() {
     let fan = "SET_FAN_SPEED%20FAN=box%20SPEED=";
     assert_eq!(scripts[..2], [format!("{fan}1"), format!("{fan}0")]);
     assert_eq!(scripts[2..], ["SET_LED%20LED=strip%20RED=0.5%20GREEN=0%20BLUE=0"]);
+}
+
+#[test]
+fn a_host_that_does_not_start_is_no_success() {
+    let card = Card::pi();
+    let (address, server) = moonraker("error");
+    let log = card.refused(&["relay", "--yes", "--moonraker", &address]);
+    assert!(
+        log.contains("klippy says: mcu 'host': Unable to connect: sudo pinion add relay --undo takes it back"),
+        "{log}"
+    );
+    card.added(&["relay", "--yes", "--undo", "--moonraker", &address]);
+    end(&address, server);
+    let (address, server) = moonraker("standby");
+    let told = card.added(&["bme280", "--yes", "--moonraker", &address]);
+    assert!(told.contains("the host reads 21.5 degrees"), "{told}");
+    end(&address, server);
 }
 
 #[test]

@@ -26,8 +26,15 @@ pub(super) fn config_txt(text: &str, sections: &[String], device: &str, wanted: 
     Some(Splice { at: text.len(), old: String::new(), new })
 }
 
-/// Whether a config.txt has the effect of this line. Sections whose condition is not known do not count.
-fn is_on(text: &str, sections: &[String], wanted: &str) -> bool {
+/// The line that a config.txt gives to 1-Wire, if it is not the overlay's own.
+pub(super) fn w1_line(text: &str, sections: &[String]) -> Option<u32> {
+    let lines = applying(text, sections);
+    let overlay = lines.iter().rev().find_map(|line| line.strip_prefix("dtoverlay=w1-gpio,"))?;
+    overlay.split(',').find_map(|parameter| parameter.trim().strip_prefix("gpiopin="))?.parse().ok()
+}
+
+/// The lines of a config.txt that apply. Sections whose condition is not known do not count.
+fn applying<'a>(text: &'a str, sections: &[String]) -> Vec<&'a str> {
     let mut applies = true;
     let mut lines = Vec::new();
     for line in text.lines().map(str::trim) {
@@ -37,6 +44,12 @@ fn is_on(text: &str, sections: &[String], wanted: &str) -> bool {
             None => {}
         }
     }
+    lines
+}
+
+/// Whether a config.txt has the effect of this line.
+fn is_on(text: &str, sections: &[String], wanted: &str) -> bool {
+    let lines = applying(text, sections);
     if let Some(wanted) = wanted.strip_prefix("dtparam=") {
         let (key, value) = wanted.split_once('=').unwrap_or((wanted, "on"));
         let settings = lines.iter().filter_map(|line| line.strip_prefix("dtparam=")).flat_map(|line| line.split(','));
@@ -197,6 +210,15 @@ mod tests {
         let two = &["dtparam=spi=on", "core_freq=250"];
         assert_eq!(with("core_freq=250\ncore_freq=400\ndtparam=spi=on", &[], two).unwrap().matches('=').count(), 1);
         assert_eq!(with("dtoverlay=w1-gpio,gpiopin=5\n", &[], &["dtoverlay=w1-gpio"]), None);
+        for (text, line) in [
+            ("dtoverlay=w1-gpio\n", None),
+            ("dtoverlay=w1-gpio,pullup=1,gpiopin=27\n", Some(27)),
+            ("dtoverlay=w1-gpio,gpiopin=27\n[none]\ndtoverlay=w1-gpio,gpiopin=5\n", Some(27)),
+            ("#dtoverlay=w1-gpio,gpiopin=27\n", None),
+            ("dtoverlay=w1-gpio,gpiopin=x\n", None),
+        ] {
+            assert_eq!(w1_line(text, &[]), line, "{text:?}");
+        }
         let adc = &["dtoverlay=anyspi:spi0-0,dev=\"microchip,mcp3208\""];
         assert!(with("dtoverlay=anyspi:spi0-1,dev=\"a,b\"\n", &[], adc).is_some());
         assert_eq!(

@@ -19,7 +19,7 @@ use nix::unistd::{Gid, Uid, getegid, geteuid, getgroups, setegid, seteuid, setgr
 use serde::{Deserialize, Serialize};
 
 use crate::cli::computer::Computer;
-use pinion_linux::foreign;
+use pinion_linux::foreign::{self, word};
 use pinion_linux::own_folder::OwnFolder;
 
 /// Longest file that is changed. A printer.cfg has some 100 kB at most.
@@ -165,6 +165,18 @@ impl Side<'_> {
         write().map_err(|error: io::Error| told(file, &error))
     }
 
+    /// Fails if somebody has protected the file: a rename would replace it all the same.
+    fn refuse_read_only(&self, file: &Path) -> Result<(), String> {
+        let _rights = Rights::of(self.owner).map_err(|error| told(file, &error))?;
+        match fs::symlink_metadata(self.computer.path(file)) {
+            Ok(about) if about.mode() & 0o200 == 0 => {
+                let path = file.display();
+                Err(format!("{path} is read-only: chmod u+w {}, then call this again", word(&path)))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn remove(&self, file: &Path) -> Result<(), String> {
         let remove = || {
             let _rights = Rights::of(self.owner)?;
@@ -207,6 +219,9 @@ impl Side<'_> {
     ///
     /// One line with the file and the cause. What was made until then is recorded.
     pub(super) fn make(&self, device: &str, new: &Record) -> Result<(), String> {
+        for file in files(&new.changes) {
+            self.refuse_read_only(&file)?;
+        }
         let old = self.record(device)?;
         let mut record = old.clone().unwrap_or_default();
         record.extend(new.clone());
@@ -242,6 +257,9 @@ impl Side<'_> {
     pub(super) fn undo(&self, device: &str, devices: &[&str]) -> Result<Vec<String>, String> {
         let mut left = Vec::new();
         let Some(record) = self.record(device)? else { return Ok(left) };
+        for file in files(&record.changes) {
+            self.refuse_read_only(&file)?;
+        }
         let mut kept = Vec::new();
         for other in devices.iter().filter(|other| **other != device) {
             let Some(mut heir) = self.record(other)? else { continue };
@@ -363,7 +381,11 @@ fn replace(folder: &OwnFolder, name: &str, bytes: &[u8]) -> io::Result<()> {
 
 fn told(file: &Path, error: &io::Error) -> String {
     let remedy = match error.kind() {
-        io::ErrorKind::PermissionDenied => ": call it with sudo",
+        io::ErrorKind::PermissionDenied if !geteuid().is_root() => ": call it with sudo",
+        io::ErrorKind::PermissionDenied => {
+            ": its owner may not write there: see ls -ld and lsattr of the file and its folder"
+        }
+        io::ErrorKind::ReadOnlyFilesystem => ": make the file system writable, then call it again",
         io::ErrorKind::StorageFull => ": make room, then call it again",
         _ => "",
     };
@@ -475,6 +497,29 @@ mod tests {
         // A pipe and a folder.
         nix::unistd::mkfifo(&computer.path("/home/pipe"), nix::sys::stat::Mode::S_IRWXU).unwrap();
         assert!(side.read(Path::new("/home/pipe")).is_err() && side.read(Path::new("/home")).is_err());
+    }
+
+    #[test]
+    fn a_file_that_somebody_has_protected_stays() {
+        let tree = Tree::new();
+        tree.put_mode("home/printer.cfg", "[mcu]\n", 0o444);
+        let computer = tree.computer();
+        let before = snapshot(&computer.path("/"));
+        let side = side(&computer);
+        let changes = vec![
+            change("a", "/home/pinion/a.cfg", true, 0, "", "[a]\n"),
+            change("i", "/home/printer.cfg", false, 0, "", "[i]\n"),
+        ];
+        let record = Record { changes, needs: vec![] };
+        let refusal = "/home/printer.cfg is read-only: chmod u+w /home/printer.cfg, then call this again";
+        assert_eq!(side.make("a", &record).unwrap_err(), refusal);
+        assert_eq!(snapshot(&computer.path("/")), before, "nothing is half done");
+        let printer_cfg = computer.path("/home/printer.cfg");
+        fs::set_permissions(&printer_cfg, Permissions::from_mode(0o644)).unwrap();
+        side.make("a", &record).unwrap();
+        fs::set_permissions(&printer_cfg, Permissions::from_mode(0o444)).unwrap();
+        assert_eq!(side.undo("a", &["a"]).unwrap_err(), refusal);
+        assert!(side.record("a").unwrap().is_some());
     }
 
     proptest! {

@@ -48,6 +48,8 @@ const MOONRAKER: &str = "127.0.0.1:7125";
 const MODULES: &str = "/etc/modules-load.d/pinion-i2c-dev.conf";
 /// How long a fan may take until its tachometer counts. klippy reports a speed each second.
 const SPIN_UP: Duration = Duration::from_secs(6);
+/// How long a sensor may take until the host has its first value. A DS18B20 takes 3 s.
+const FIRST_VALUE: Duration = Duration::from_secs(8);
 /// The key of the change of the boot loader's settings, with the bus behind it.
 const BUS: &str = "bus";
 
@@ -291,7 +293,7 @@ fn undo(
         records.iter().flat_map(|(_, record)| &record.changes).map(|change| change.file.as_path()).collect();
     files.iter().for_each(|file| report.line(format_args!("  {}", file.display())));
     report.set("changes", json!(files));
-    ask(args, report, "Put them back?")?;
+    ask(args, computer, report, "Put them back?")?;
     let mut reboots = false;
     for (side, record) in &records {
         reboots |= record.changes.iter().any(|change| change.key.starts_with(BUS));
@@ -330,7 +332,7 @@ fn refuse_while_printing(args: &AddArgs, computer: &Computer) -> Result<(), Stri
 }
 
 /// Asks before a change.
-fn ask(args: &AddArgs, report: &mut Report, question: &str) -> Result<(), String> {
+fn ask(args: &AddArgs, computer: &Computer, report: &mut Report, question: &str) -> Result<(), String> {
     const REFUSED: &str = "nothing is changed";
     if args.yes {
         return Ok(());
@@ -343,7 +345,8 @@ fn ask(args: &AddArgs, report: &mut Report, question: &str) -> Result<(), String
     let mut answer = String::new();
     io::stdin().lock().read_line(&mut answer).map_err(|error| format!("{REFUSED}: {error}"))?;
     match answer.trim().to_ascii_lowercase().as_str() {
-        "y" | "yes" => Ok(()),
+        // A print may have begun before the answer.
+        "y" | "yes" => refuse_while_printing(args, computer),
         _ => Err(REFUSED.into()),
     }
 }
@@ -373,6 +376,7 @@ impl Work<'_> {
         let taken = printer.as_ref().map(|printer| printer.taken(self.device)).unwrap_or_default();
         let uses = |kind: Kind, node: &str| printer.as_ref()?.user(self.device, kind, node);
         self.spot = self.board.spot(self.way, &uses)?;
+        self.move_w1()?;
         let wires = self.board.wires(self.way, &self.spot, &taken, self.args.pin)?;
         self.draw(&wires)?;
         let rests = refuse_while_printing(self.args, self.computer);
@@ -412,6 +416,19 @@ impl Work<'_> {
             return Err(no_printer.unwrap_or_default());
         };
         self.configure(&printer, &wires, address)
+    }
+
+    /// Puts the wire of 1-Wire at the line that config.txt names.
+    fn move_w1(&mut self) -> Result<(), String> {
+        let files: Vec<&str> = self.board.files.iter().map(String::as_str).collect();
+        let (Kind::W1, Some(file)) = (self.way.bus, self.computer.first(&files)) else { return Ok(()) };
+        let text = system(self.computer).read(Path::new(file))?.unwrap_or_default();
+        let Some(line) = boot::w1_line(&text, &self.board.sections) else { return Ok(()) };
+        let label = format!("GPIO{line}");
+        let at = self.board.pins.iter().position(|pin| pin.split(' ').next() == Some(&*label));
+        let pin = at.ok_or_else(|| format!("{file}: w1-gpio is on line {line}, which is not on the header"))? + 1;
+        self.spot.pins.insert("data".into(), pin);
+        Ok(())
     }
 
     /// The command that continues.
@@ -514,9 +531,8 @@ impl Work<'_> {
 
     /// Whether the bus, or the device of the chip's driver, is there.
     fn is_there(&self, node: &str) -> bool {
-        if let Some(driver) = &self.way.driver {
-            let names = self.computer.matching("/sys/bus/iio/devices/iio:device*/name");
-            return names.iter().any(|name| self.computer.text(self.computer.name(name)).as_deref() == Some(driver));
+        if self.way.driver.is_some() {
+            return self.iio().is_some();
         }
         let path = match self.way.bus {
             Kind::W1 => format!("/sys/bus/w1/devices/{node}"),
@@ -553,6 +569,7 @@ impl Work<'_> {
                     Err("no DS18B20 answers: check its wires and the resistor of 4.7 kOhm from data to 3.3 V".into())
                 }
             },
+            (Some(Check::Iio { file, highest }), _) => self.sample(file, *highest),
             (Some(_), false) => match probe::Live::of(&node) {
                 Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &mut live)),
                 None => Err(format!("{node} is no bus")),
@@ -570,6 +587,28 @@ impl Work<'_> {
             Ok(answer) => Ok(answer.address),
             Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, self.command())),
         }
+    }
+
+    /// Reads a value of the chip by its driver, which does not know whether the chip is there.
+    fn sample(&self, file: &str, highest: u32) -> Result<probe::Answer, String> {
+        let folder = self.iio().ok_or("its driver has gone: reboot")?;
+        let value = self.computer.text(self.computer.name(&folder.join(file)));
+        let value: u32 = value.and_then(|text| text.parse().ok()).ok_or_else(|| format!("{file} cannot be read"))?;
+        match value {
+            0 => Err(format!("{file} is 0: no power, DOUT is not connected, or the input touches ground")),
+            _ if value >= highest => {
+                Err(format!("{file} is {value}, the highest value: no ground, or nothing is connected at the input"))
+            }
+            _ => Ok(probe::Answer { told: format!("{file} is {value} of {highest}"), address: None }),
+        }
+    }
+
+    /// The folder of the device of the chip's driver.
+    fn iio(&self) -> Option<PathBuf> {
+        let driver = self.way.driver.as_deref();
+        let names = self.computer.matching("/sys/bus/iio/devices/iio:device*/name");
+        let name = names.iter().find(|name| self.computer.text(self.computer.name(name)).as_deref() == driver)?;
+        name.parent().map(Path::to_owned)
     }
 
     /// A thermometer that printer.cfg does not have yet.
@@ -619,7 +658,8 @@ impl Work<'_> {
             self.report.line("Nothing is left to change.");
         }
         if self.computer.is_this() || self.args.moonraker != MOONRAKER {
-            self.measure(is_changed);
+            let undo = format!("{} --undo takes it back", self.command());
+            self.measure(is_changed).map_err(|why| if is_own { format!("{why}: {undo}") } else { why })?;
         }
         self.report.set("next", json!(self.device.next));
         self.report.line("Next:");
@@ -684,7 +724,7 @@ impl Work<'_> {
         if self.computer.is_this() && side.owner.is_none() && !geteuid().is_root() {
             return Err(format!("these files are root's: {}", self.command()));
         }
-        ask(self.args, self.report, question)?;
+        ask(self.args, self.computer, self.report, question)?;
         side.make(self.device.name, record)?;
         for file in
             record.changes.iter().filter(|change| !change.makes).map(|change| &change.file).collect::<BTreeSet<_>>()
@@ -711,48 +751,56 @@ impl Work<'_> {
         if is_known || !is_shared { Ok(()) } else { side.make(self.device.name, record) }
     }
 
-    /// Restarts the host, and asks it for a first value. A failure here undoes nothing: it is reported.
-    fn measure(&mut self, is_changed: bool) {
+    /// Restarts the host, and asks it for a first value.
+    fn measure(&mut self, is_changed: bool) -> Result<(), String> {
         let moonraker = Moonraker(&self.args.moonraker);
-        let measured = || -> Result<String, String> {
-            match moonraker.host() {
-                Host::Rests => {}
-                Host::Prints => return Err("the host prints: run FIRMWARE_RESTART after the print".into()),
-                Host::Unknown(why) => return Err(format!("{why}: run FIRMWARE_RESTART in the host")),
-            }
-            if is_changed {
-                moonraker.restart()?;
-            }
-            if self.device.resonance {
-                let command = format!("ACCELEROMETER_QUERY%20CHIP={}", self.device.section);
-                let lines = moonraker.run(&command)?;
-                let values = lines.iter().find_map(|line| acceleration(line));
-                return values.ok_or_else(|| "ACCELEROMETER_QUERY answers no values: see klippy.log".to_owned())?;
-            }
-            if let Some(fan) = self.device.section.strip_prefix("fan_generic ") {
-                return turns(&moonraker, &self.device.section, fan);
-            }
-            if let Some(strip) = self.device.section.strip_prefix("neopixel ") {
-                moonraker.run(&format!("SET_LED%20LED={strip}%20RED=0.5%20GREEN=0%20BLUE=0"))?;
-                return Ok(
-                    "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
-                           dark, check its 5 V, its ground, and that the wire goes to DIN"
-                        .into(),
-                );
-            }
-            if self.device.section.starts_with("temperature_sensor ") {
-                let degrees = moonraker.value(&self.device.section, "temperature")?;
-                return match (-40.0..=150.0).contains(&degrees) {
-                    true => Ok(format!("the host reads {degrees:.1} degrees")),
-                    false => Err(format!("the host reads {degrees:.1} degrees: check the sensor's wires and type")),
-                };
-            }
-            Ok("the host has restarted with it".into())
+        let left = match moonraker.host() {
+            Host::Rests => None,
+            Host::Prints => Some("the host prints: run FIRMWARE_RESTART after the print".to_owned()),
+            Host::Unknown(why) => Some(format!("{why}: run FIRMWARE_RESTART in the host")),
         };
-        let told = measured();
-        self.report.set("measured", json!(told.as_ref().ok()));
-        self.report.set("warning", json!(told.as_ref().err()));
-        self.report.line(told.unwrap_or_else(|why| why));
+        self.report.set("warning", json!(left));
+        if let Some(left) = left {
+            self.report.line(left);
+            return Ok(());
+        }
+        let restarted = if is_changed { moonraker.restart() } else { Ok(()) };
+        let measured = restarted.and_then(|()| self.first_value(&moonraker))?;
+        self.report.line(&measured);
+        self.report.set("measured", json!(measured));
+        Ok(())
+    }
+
+    /// What the host measures with the device, in words.
+    fn first_value(&self, moonraker: &Moonraker) -> Result<String, String> {
+        let section = &self.device.section;
+        if self.device.resonance {
+            let lines = moonraker.run(&format!("ACCELEROMETER_QUERY%20CHIP={section}"))?;
+            let values = lines.iter().find_map(|line| acceleration(line));
+            return values.ok_or_else(|| "ACCELEROMETER_QUERY answers no values: see klippy.log".to_owned())?;
+        }
+        if let Some(fan) = section.strip_prefix("fan_generic ") {
+            return turns(moonraker, section, fan);
+        }
+        if let Some(strip) = section.strip_prefix("neopixel ") {
+            moonraker.run(&format!("SET_LED%20LED={strip}%20RED=0.5%20GREEN=0%20BLUE=0"))?;
+            let told = "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
+                        dark, check its 5 V, its ground, and that the wire goes to DIN";
+            return Ok(told.into());
+        }
+        if section.starts_with("temperature_sensor ") {
+            let degrees = temperature(moonraker, section)?;
+            return match (-40.0..=150.0).contains(&degrees) {
+                true => Ok(format!("the host reads {degrees:.1} degrees")),
+                false => Err(format!("the host reads {degrees:.1} degrees: check the sensor's wires and type")),
+            };
+        }
+        if let Some(command) = &self.device.measure {
+            let lines = moonraker.run(&command.replace(' ', "%20").replace('"', "%22"))?;
+            let lines: Vec<&str> = lines.iter().map(|line| line.trim_start_matches("// ")).collect();
+            return Ok(format!("{command}: {}", lines.join("; ")));
+        }
+        Ok("the host has restarted with it".into())
     }
 }
 
@@ -782,6 +830,21 @@ fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
     pins.filter_map(stray).collect()
 }
 
+/// A sensor's first temperature. klippy says 0 until it has one.
+fn temperature(moonraker: &Moonraker, section: &str) -> Result<f64, String> {
+    let end = Instant::now() + FIRST_VALUE;
+    loop {
+        let degrees = moonraker.value(section, "temperature")?;
+        if degrees != 0.0 {
+            return Ok(degrees);
+        }
+        if Instant::now() >= end {
+            return Err("the host has read no temperature yet: see klippy.log".into());
+        }
+        thread::sleep(Duration::from_millis(500));
+    }
+}
+
 /// Lets a fan run at full speed until its tachometer counts.
 fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, String> {
     let speed = |speed: &str| moonraker.run(&format!("SET_FAN_SPEED%20FAN={fan}%20SPEED={speed}"));
@@ -797,7 +860,10 @@ fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, Stri
     speed("0")?;
     match counted? {
         rpm if rpm > 0.0 => Ok(format!("the tachometer counts {rpm:.0} turns a minute at full speed")),
-        _ => Err("the tachometer counts nothing at full speed: check that the fan runs, and its yellow wire".into()),
+        _ => {
+            Err("the tachometer counts nothing at full speed: check that the fan runs, and the wire of its tachometer"
+                .into())
+        }
     }
 }
 

@@ -16,8 +16,8 @@ use serde_json::Value;
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long an answer may take. A restart answers at once, and a measurement after some seconds.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long klippy may take to start. A printer with many MCUs takes some ten seconds.
-const START_TIMEOUT: Duration = Duration::from_secs(60);
+/// How long klippy may take to start. After 90 s it says itself which MCU does not answer.
+const START_TIMEOUT: Duration = Duration::from_secs(120);
 /// Longest answer that is read. The console's last lines have some kilobytes.
 const ANSWER_MAX: u64 = 4 << 20;
 /// How often klippy's state is asked while it starts.
@@ -83,7 +83,7 @@ impl Moonraker<'_> {
                     return Err(format!("klippy says: {message}"));
                 }
                 _ if asked.elapsed() < START_TIMEOUT => {}
-                _ => return Err("klippy is not ready after a minute: see klippy.log".into()),
+                _ => return Err("klippy is not ready after two minutes: see klippy.log".into()),
             }
         }
     }

@@ -15,7 +15,8 @@ use glob::Pattern;
 use crate::cli::computer::Computer;
 use crate::cli::doctor::host::klippys;
 use crate::cli::doctor::printer::{name_of, without_comment};
-use pinion_runtime::klippy::is_host_path;
+use pinion_linux::foreign::word;
+use pinion_runtime::klippy::HOST_PATHS;
 
 use super::catalog::{Device, Kind};
 use super::change::{Change, Side, Splice};
@@ -45,8 +46,10 @@ struct Section {
 /// klippy's configuration.
 #[derive(Debug)]
 pub(super) struct Printer {
-    /// printer.cfg, as a path of the computer.
-    pub(super) path: PathBuf,
+    /// printer.cfg as klippy names it, as a path of the computer. klippy looks for includes in its folder.
+    path: PathBuf,
+    /// The file itself: klippy may name it by a link.
+    file: PathBuf,
     /// Its owner and group.
     pub(super) owner: (u32, u32),
     /// The contents of printer.cfg itself.
@@ -63,16 +66,10 @@ pub(super) struct Printer {
 /// One line: there is none, or there are several.
 pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf, String> {
     if let Some(named) = named {
-        return Ok(named.to_owned());
+        let absolute = if computer.is_this() { std::path::absolute(named) } else { Ok(Path::new("/").join(named)) };
+        return absolute.map_err(|error| format!("{}: {error}", named.display()));
     }
-    let of_klippys: BTreeSet<PathBuf> = klippys(computer).into_iter().filter_map(|klippy| klippy.config).collect();
-    let usual =
-        || USUAL.iter().map(|pattern| computer.matching(pattern)).find(|found| !found.is_empty()).unwrap_or_default();
-    let found = match of_klippys.is_empty() {
-        true => usual().iter().map(|path| computer.name(path)).collect(),
-        false => of_klippys,
-    };
-    let mut found = found.into_iter();
+    let mut found = configs(computer).into_iter();
     match (found.next(), found.next()) {
         (Some(path), None) => Ok(path),
         (None, _) => Err("there is no printer.cfg: name yours with --config FILE".into()),
@@ -84,6 +81,30 @@ pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf,
     }
 }
 
+/// The configurations of the computer's klippys, or those in the usual places.
+fn configs(computer: &Computer) -> BTreeSet<PathBuf> {
+    let of_klippys: BTreeSet<PathBuf> = klippys(computer).into_iter().filter_map(|klippy| klippy.config).collect();
+    if !of_klippys.is_empty() {
+        return of_klippys;
+    }
+    let usual = USUAL.iter().map(|pattern| computer.matching(pattern)).find(|found| !found.is_empty());
+    usual.unwrap_or_default().iter().map(|path| computer.name(path)).collect()
+}
+
+/// The file behind a path, as a path of the computer.
+fn behind(computer: &Computer, path: &Path) -> Option<PathBuf> {
+    let file = computer.follow(path).ok()?.pop()?;
+    Some(computer.name(&file.canonicalize().ok()?))
+}
+
+/// The link by which klippy names this file.
+fn link_to(computer: &Computer, file: &Path) -> Option<PathBuf> {
+    let file = behind(computer, file)?;
+    let is_it =
+        |config: &PathBuf| computer.path(config).is_symlink() && behind(computer, config).as_ref() == Some(&file);
+    configs(computer).into_iter().find(is_it)
+}
+
 impl Printer {
     /// Reads it, with the files that it includes. A file that cannot be read, such as another user's, does not count.
     ///
@@ -93,14 +114,25 @@ impl Printer {
     pub(super) fn read(computer: &Computer, path: &Path) -> Result<Printer, String> {
         let about = std::fs::symlink_metadata(computer.path(path));
         let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", path.display()))?;
+        if about.is_symlink() {
+            let file = behind(computer, path).map_or("FILE".into(), |file| word(file.display()));
+            return Err(format!("{}: it is a link: name the file that it leads to: --config {file}", path.display()));
+        }
         let owner = (about.uid(), about.gid());
         let side = Side { computer, owner: Some(owner), records: PathBuf::new() };
         let text = side.read(path)?.unwrap_or_default();
-        let mut printer =
-            Printer { path: path.to_owned(), owner, text, sections: BTreeMap::new(), includes: Vec::new() };
+        let named = link_to(computer, path).unwrap_or_else(|| path.to_owned());
+        let mut printer = Printer {
+            path: named.clone(),
+            file: path.to_owned(),
+            owner,
+            text,
+            sections: BTreeMap::new(),
+            includes: Vec::new(),
+        };
         let mut files = 0;
         let text = printer.text.clone();
-        printer.take(computer, path, &text, &mut Vec::new(), &mut files);
+        printer.take(computer, &named, &text, &mut Vec::new(), &mut files);
         Ok(printer)
     }
 
@@ -220,7 +252,7 @@ impl Printer {
     fn mcus(&self) -> impl Iterator<Item = (&str, &Section)> {
         self.sections.iter().filter_map(|(name, section)| {
             let name = if name == "mcu" { name.as_str() } else { name.strip_prefix("mcu ")?.trim() };
-            let is_own = section.values.get("serial").is_some_and(|serial| is_host_path(Path::new(serial)));
+            let is_own = section.values.get("serial").is_some_and(|serial| serial.starts_with(HOST_PATHS));
             is_own.then_some((name, section))
         })
     }
@@ -232,8 +264,8 @@ impl Printer {
 
     /// The link by which klippy finds this computer's MCU.
     pub(super) fn link(&self) -> &Path {
-        let serials = self.sections.values().filter_map(|section| section.values.get("serial"));
-        serials.map(Path::new).find(|serial| is_host_path(serial)).unwrap_or(Path::new(LINK))
+        let serial = self.mcus().find_map(|(_, section)| section.values.get("serial"));
+        serial.map_or(Path::new(LINK), Path::new)
     }
 
     /// The middle of the bed.
@@ -298,7 +330,7 @@ impl Printer {
             pattern.is_some_and(|pattern| pattern.matches_path(&folder.join("any-name.cfg")))
         });
         if !is_included {
-            changes.push(Change { key: INCLUDE.into(), file: self.path.clone(), makes: false, splice: self.include() });
+            changes.push(Change { key: INCLUDE.into(), file: self.file.clone(), makes: false, splice: self.include() });
         }
         Ok((changes, needs))
     }
@@ -417,6 +449,9 @@ mod tests {
         let pico = "[mcu]\nserial: /dev/serial/by-id/x\n[fan]\npin: gpio17\n[mcu pi]\nserial: /tmp/klipper_host_mcu\n\
                     [output_pin a]\npin: !pi:gpio27\n";
         assert_eq!(taken(pico), ("pi".into(), vec!["gpio27".into()]));
+        // Any path that klippy takes for a pseudo terminal.
+        let folder = "[mcu rpi]\nserial: /tmp/klipper_host_mine/tty\n[fan]\npin: rpi:GPIO17\n";
+        assert_eq!(taken(folder), ("rpi".into(), vec!["GPIO17".into()]));
         // Pinion as the only MCU.
         let alone = "[mcu]\nserial: /tmp/klipper_host_mcu\n[fan]\npin: !GPIO17\n[x]\na_pins: mcu:GPIO5, ^ebb:GPIO6\n";
         assert_eq!(taken(alone), ("mcu".into(), vec!["GPIO17".into(), "GPIO5".into()]));
@@ -437,6 +472,27 @@ mod tests {
         }
     }
 
+    /// klippy looks for includes beside the link.
+    #[test]
+    fn the_device_s_files_are_where_klippy_looks_for_them() {
+        let tree = Tree::new();
+        tree.put("home/pi/dotfiles/printer.cfg", "[include other.cfg]\n[fan]\npin: a\n");
+        tree.put("home/pi/printer_data/config/other.cfg", "[adxl345]\n");
+        tree.link("home/pi/printer_data/config/printer.cfg", "../../dotfiles/printer.cfg");
+        let error = Printer::read(&tree.computer(), Path::new(CONFIG)).unwrap_err();
+        let file = "/home/pi/dotfiles/printer.cfg";
+        assert!(error.ends_with(&format!("--config {file}")), "{error}");
+        let printer = Printer::read(&tree.computer(), Path::new(file)).unwrap();
+        assert!(printer.sections.contains_key("adxl345"), "{printer:?}");
+        let computer = tree.computer();
+        let side = Side { computer: &computer, owner: None, records: printer.folder() };
+        let catalog = Catalog::read().unwrap();
+        let (changes, _) = printer.plan(&side, catalog.device("relay").unwrap(), "[x]\n").unwrap();
+        let files: Vec<&str> = changes.iter().map(|change| change.file.to_str().unwrap()).collect();
+        let folder = "/home/pi/printer_data/config/pinion";
+        assert_eq!(files, [&*format!("{folder}/host-mcu.cfg"), &*format!("{folder}/relay.cfg"), file]);
+    }
+
     #[test]
     fn of_several_hosts_one_is_named_and_a_link_is_none() {
         let tree = Tree::new();
@@ -447,7 +503,7 @@ mod tests {
         tree.put("etc/shadow", "x");
         tree.link("home/c/printer.cfg", "../../etc/shadow");
         let error = Printer::read(&tree.computer(), Path::new("/home/c/printer.cfg")).unwrap_err();
-        assert!(error.contains("it is a link"), "{error}");
+        assert!(error.ends_with("it is a link: name the file that it leads to: --config /etc/shadow"), "{error}");
         // A file that includes itself, or everything.
         tree.put("home/a/printer_data/config/printer.cfg", "[include *.cfg]\n[include /*/*]\n[fan]\npin: a\n");
         let path = Path::new("/home/a/printer_data/config/printer.cfg");

@@ -7,7 +7,7 @@ use pinion_firmware::board::{Board as _, BusDevice, BusError, BusStatus, I2cConf
 use pinion_linux::LinuxBoard;
 use pinion_linux::gpio::FastGpio;
 
-use super::catalog::{Catalog, Check, Way};
+use super::catalog::{Catalog, Check, Fault, Kind, Way};
 
 /// How often a register is read. A loose wire answers differently each time.
 const READS: usize = 8;
@@ -94,14 +94,11 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
                 // A chip that speaks I2C until the first edge of its chip select answers nothing here.
                 read()?;
                 let answers = (0..READS).map(|_| read()).collect::<Result<Vec<u8>, String>>()?;
-                judge(catalog, *register, ids, &answers).map(|told| Answer { told, address: None })
+                judge(catalog, Kind::Spi, *register, ids, &answers).map(|told| Answer { told, address: None })
             }
-            Check::Alive { register, bytes } => {
-                let answer = exchange(&mut *device, *register, *bytes)?;
-                match silence(&answer) {
-                    Some(why) => Err(why),
-                    None => Ok(Answer { told: format!("it answers {}", hex(&answer)), address: None }),
-                }
+            Check::Fixed { register, mask, bits, faults } => {
+                let answer = exchange(&mut *device, *register, mask.len())?;
+                fixed(&answer, mask, bits, faults).map(|told| Answer { told, address: None })
             }
             _ => Ok(Answer { told: "it cannot be asked over SPI: try it out".into(), address: None }),
         };
@@ -151,10 +148,14 @@ fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result
         Check::Id { register, ids } => {
             let answers: Vec<u8> =
                 (0..READS).map(|_| read(&[*register], 1).map(|bytes| bytes[0])).collect::<Result<_, _>>()?;
-            judge(catalog, *register, ids, &answers).map_err(Failure::Wrong)
+            judge(catalog, Kind::I2c, *register, ids, &answers).map_err(Failure::Wrong)
         }
         Check::Answer { write, bytes, crc } => {
             let answer = read(write, *bytes)?;
+            // A register may hold zeros, but not ones only.
+            if let Some(why) = silence(Kind::I2c, &answer).filter(|_| answer.first() != Some(&0)) {
+                return Err(Failure::Wrong(why));
+            }
             if *crc && answer.len() == 3 && crc8(&answer[..2]) != answer[2] {
                 return Err(Failure::Wrong(format!("{} has a wrong CRC: shorten the wires", hex(&answer))));
             }
@@ -162,15 +163,19 @@ fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result
         }
         Check::Temperature { write, bytes } => {
             let answer = read(write, *bytes)?;
+            if let Some(why) = silence(Kind::I2c, &answer) {
+                return Err(Failure::Wrong(why));
+            }
             let high = answer.first().copied().unwrap_or_default();
             let low = answer.get(1).copied().unwrap_or_default();
             let degrees = f64::from(i16::from_be_bytes([high, low])) / 256.0;
-            match TEMPERATURES.contains(&degrees) {
+            // None of these chips measures less than 1/16 degree.
+            match TEMPERATURES.contains(&degrees) && low & 0x0f == 0 {
                 true => Ok(format!("it measures {degrees:.1} degrees")),
                 false => Err(Failure::Wrong(format!("{degrees:.1} degrees is no temperature: it is another chip"))),
             }
         }
-        Check::Alive { .. } | Check::W1 => Ok("it cannot be asked over I2C: try it out".into()),
+        Check::Fixed { .. } | Check::W1 | Check::Iio { .. } => Ok("it cannot be asked over I2C: try it out".into()),
     }
 }
 
@@ -188,7 +193,7 @@ fn exchange(device: &mut dyn BusDevice, register: Option<u8>, count: usize) -> R
 }
 
 /// The meaning of a chip's answers to the question for its id.
-fn judge(catalog: &Catalog, register: u8, ids: &[u8], answers: &[u8]) -> Result<String, String> {
+fn judge(catalog: &Catalog, bus: Kind, register: u8, ids: &[u8], answers: &[u8]) -> Result<String, String> {
     let first = answers.first().copied().unwrap_or_default();
     if answers.iter().any(|answer| *answer != first) {
         return Err(format!(
@@ -199,7 +204,7 @@ fn judge(catalog: &Catalog, register: u8, ids: &[u8], answers: &[u8]) -> Result<
     if ids.contains(&first) {
         return Ok(format!("its id is {first:#04x}"));
     }
-    if let Some(why) = silence(&[first]) {
+    if let Some(why) = silence(bus, &[first]) {
         return Err(why);
     }
     let wanted = ids.first().copied().unwrap_or_default();
@@ -214,21 +219,36 @@ fn judge(catalog: &Catalog, register: u8, ids: &[u8], answers: &[u8]) -> Result<
     }
 }
 
-/// The meaning of all zeros or all ones.
-fn silence(answer: &[u8]) -> Option<String> {
-    let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
-    if is_all(0) {
-        return Some(
-            "it answers all zeros: no power, the chip's data output (SDO, MISO) or CS is not connected, or the pin is \
-             still GPIO"
-                .into(),
-        );
+/// The meaning of an answer in which some bits never change.
+fn fixed(answer: &[u8], mask: &[u8], bits: &[u8], faults: &[Fault]) -> Result<String, String> {
+    if let Some(why) = silence(Kind::Spi, answer) {
+        return Err(why);
     }
-    is_all(0xff).then(|| {
-        "it answers all ones: no ground, CS does not reach the chip, or its data input (SDA, MOSI) or clock is not \
-         connected"
-            .into()
-    })
+    let told = format!("it answers {}", hex(answer));
+    if answer.iter().zip(mask).zip(bits).any(|((answer, mask), bits)| answer & mask != *bits) {
+        return Err(format!("{told}, as this chip never does: it is another chip, or data wires are swapped"));
+    }
+    match faults.iter().find(|fault| answer.get(fault.byte).is_some_and(|byte| byte & fault.bit != 0)) {
+        Some(fault) => Err(format!("{told}: {}", fault.meaning)),
+        None => Ok(told),
+    }
+}
+
+/// What all zeros or all ones mean.
+fn silence(bus: Kind, answer: &[u8]) -> Option<String> {
+    let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
+    let why = match (bus, is_all(0), is_all(0xff)) {
+        (Kind::I2c, true, _) => "all zeros: another chip holds SDA low, or it is broken",
+        (Kind::I2c, _, true) => "all ones: its power or ground is loose, or it is another chip",
+        (_, true, _) => {
+            "all zeros: no power, the chip's data output (SDO, MISO) or CS is not connected, or the pin is still GPIO"
+        }
+        (_, _, true) => {
+            "all ones: no ground, CS does not reach the chip, or its data input (SDA, MOSI) or clock is not connected"
+        }
+        _ => return None,
+    };
+    Some(format!("it answers {why}"))
 }
 
 /// The CRC of Sensirion's chips: polynomial 0x31, begun with 0xff (data sheet of the SHT3x).
@@ -274,7 +294,8 @@ mod tests {
 
     impl BusDevice for Chip {
         fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-            let head = usize::from(bytes.len() == 2);
+            // A register's number is not 0 here.
+            let head = usize::from(bytes[0] != 0);
             self.fill(&mut bytes[head..]);
             Ok(())
         }
@@ -327,9 +348,35 @@ mod tests {
         let noise = told("adxl345", 0, &[(0, &[0xe5, 0x12, 0xe5, 0xff])]).unwrap_err();
         assert!(noise.starts_with("its id changes from read to read (12 e5 ff"), "{noise}");
         assert_eq!(told("lis2dw", 0, &[(0, &[0x33])]).unwrap_err().rsplit_once(": ").unwrap().1, "pinion add lis3dh");
-        assert!(told("max31855", 0, &[(0, &[0; 4])]).unwrap_err().contains("all zeros"));
-        assert!(told("max31856", 0, &[(0, &[0xff])]).unwrap_err().contains("all ones"));
-        assert_eq!(told("max31855", 0, &[(0, &[1, 0x90, 0x19, 0])]).unwrap().told, "it answers 01 90 19 00");
+    }
+
+    #[test]
+    fn a_thermocouple_amplifier_is_known_by_the_bits_that_never_change() {
+        for (device, answer, words) in [
+            ("max31855", &[0x01, 0x90, 0x19, 0x00][..], Ok("it answers 01 90 19 00")),
+            ("max31855", &[0x00; 4], Err("all zeros")),
+            ("max31855", &[0xff; 4], Err("all ones")),
+            ("max31855", &[0x5a; 4], Err("5a 5a 5a 5a, as this chip never does: it is another chip")),
+            ("max31855", &[0x00, 0x01, 0x19, 0x01], Err("no thermocouple is connected")),
+            ("max31855", &[0x00, 0x01, 0x19, 0x02], Err("touches ground")),
+            ("max31855", &[0x00, 0x01, 0x19, 0x04], Err("touches its supply")),
+            ("max6675", &[0x0c, 0x80], Ok("it answers 0c 80")),
+            ("max6675", &[0x0c, 0x84], Err("no thermocouple is connected")),
+            ("max6675", &[0x8c, 0x80], Err("as this chip never does")),
+            ("max31856", &[0x7f, 0xc0, 0x7f, 0xff, 0x80, 0x00], Ok("it answers 7f c0")),
+            ("max31856", &[0xff; 6], Err("all ones")),
+            // Shifted by a bit.
+            ("max31856", &[0x3f, 0xe0, 0x3f, 0xff, 0xc0, 0x00], Err("as this chip never does")),
+            ("max31865", &[0xff, 0xff, 0x00, 0x00], Ok("it answers ff ff 00 00")),
+            ("max31865", &[0x7f, 0xff, 0x80, 0x00], Err("as this chip never does")),
+        ] {
+            let result = told(device, 0, &[(0, answer)]);
+            let result = result.as_ref().map(|answer| &*answer.told).map_err(|why| &**why);
+            match (result, words) {
+                (Ok(told), Ok(words)) | (Err(told), Err(words)) => assert!(told.contains(words), "{device}: {told}"),
+                _ => panic!("{device} {answer:x?}: {result:?}"),
+            }
+        }
     }
 
     #[test]
@@ -355,6 +402,52 @@ mod tests {
         assert_eq!(crc8(&[0xbe, 0xef]), 0x92);
         assert!(told("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
         assert!(told("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
+    }
+
+    /// Wrong answers of every chip that can be asked.
+    #[test]
+    fn no_device_of_the_catalog_is_taken_for_there_by_a_wrong_answer() {
+        let catalog = Catalog::read().unwrap();
+        let mut asked = 0;
+        for device in &catalog.devices {
+            for way in &device.way {
+                let Some(check) = &way.check else { continue };
+                let mut answers: Vec<(&str, Vec<u8>)> =
+                    vec![("ones", vec![0xff; 8]), ("noise", vec![0x5a, 0xa7, 0x31])];
+                match check {
+                    Check::Id { ids, .. } => {
+                        answers.push(("zeros", vec![0; 8]));
+                        answers.extend(
+                            ids.iter()
+                                .flat_map(|id| [id >> 1, id >> 1 | 0x80, id << 1, id << 1 | 1])
+                                .map(|shifted| ("shifted", vec![shifted])),
+                        );
+                        let others = catalog.devices.iter().flat_map(|other| &other.way);
+                        let others = others.filter_map(|way| match &way.check {
+                            Some(Check::Id { ids, .. }) => Some(ids),
+                            _ => None,
+                        });
+                        let others = others.flatten().filter(|id| !ids.contains(id));
+                        answers.extend(others.map(|id| ("another chip", vec![*id])));
+                    }
+                    Check::Fixed { .. } | Check::Temperature { .. } => answers.push(("zeros", vec![0; 8])),
+                    Check::Answer { .. } => answers.retain(|(what, _)| *what == "ones"),
+                    Check::W1 | Check::Iio { .. } => continue,
+                }
+                for (what, answer) in answers {
+                    let addresses = way.addresses.iter().copied().chain([0]);
+                    let mut chips = Chips(addresses.map(|address| (address, answer.clone())).collect());
+                    let told = ask(&catalog, way, &mut chips);
+                    assert!(told.is_err(), "{} by {:?}, {what} {answer:x?}: {told:?}", device.name, way.bus);
+                    asked += 1;
+                }
+                if !way.addresses.is_empty() {
+                    let told = ask(&catalog, way, &mut Chips::default()).unwrap_err();
+                    assert!(told.starts_with("nobody answers at 0x"), "{}: {told}", device.name);
+                }
+            }
+        }
+        assert!(asked > 100, "{asked}");
     }
 
     /// The chips of a simulated printer.
