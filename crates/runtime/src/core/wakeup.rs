@@ -40,13 +40,12 @@ impl Default for MarginLimits {
 
 impl MarginLimits {
     /// Bounds of 5 (3 for close timers) and `us` microseconds. A bound that is longer than `us` is `us`.
-    pub const fn up_to_us(us: u32) -> MarginLimits {
-        let at_most = |most: u32| Ticks::from_us(if us < most { us } else { most });
-        MarginLimits { min: at_most(5), close: at_most(3), max: Ticks::from_us(us) }
+    pub fn up_to_us(us: u32) -> MarginLimits {
+        MarginLimits { min: Ticks::from_us(us.min(5)), close: Ticks::from_us(us.min(3)), max: Ticks::from_us(us) }
     }
 
     /// These bounds, all the same.
-    pub const fn always(margin: Ticks) -> MarginLimits {
+    pub fn always(margin: Ticks) -> MarginLimits {
         MarginLimits { min: margin, close: margin, max: margin }
     }
 }
