@@ -12,8 +12,8 @@ use super::translate::Translator;
 const BEFORE_ENDSTOP_MM: f64 = 15.0;
 /// How high the nozzle begins over the bed.
 const START_HEIGHT_MM: f64 = 8.0;
-/// How far motors of one z axis are apart at first, if klippy can level them.
-const TILT_MM: [f64; 4] = [0.0, 0.4, -0.3, 0.5];
+/// How far motors of one z axis are apart at first, if klippy can level them. The corners of a rectangle are in a plane.
+const TILT_MM: [f64; 4] = [0.0, 0.4, 0.1, -0.3];
 /// A motor without an end of its own.
 const FREE_MM: f64 = 1000.0;
 
@@ -282,7 +282,7 @@ impl<'a> Translator<'a> {
                 ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
                 _ => rail.before_endstop(),
             };
-            let entry = Entry::default().set("name", name).set("along", along);
+            let entry = Entry::default().set("name", name);
             self.out.add("carriage", Translator::with_rail(entry, &rail, &endstop, start));
         }
         for section in self.config.of_kind("stepper") {
