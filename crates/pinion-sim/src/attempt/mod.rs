@@ -294,6 +294,8 @@ impl Trial<'_> {
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
                 Ok(_) => thread::sleep(Duration::from_millis(100)),
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
                 Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
             }
         }
