@@ -214,7 +214,7 @@ pub const MISTAKES: &[Mistake] = &[
     late("heater: extruder", "heater: extruder2", "heater: extruder2", "Unknown heater 'extruder2'"),
     // Pins.
     early("dir_pin: PB7", "dir_pin: PB9", "dir_pin: PB9", "pin PB9 used multiple times in config"),
-    early("pin: PA8", "pin: PA7", "pin: PA7", "pin PA7 used multiple times in config"),
+    early("pin: PA8", "pin: !PA7", "pin: !PA7", "pin PA7 used multiple times in config"),
     early("pin: PA9", "pin: PC8", "pin: PC8", "pin PC8 used multiple times in config"),
     early(
         "enable_pin: !PC3\nmicrosteps: 16\nrotation_distance: 40\ngear",

@@ -219,6 +219,25 @@ impl Host {
     }
 }
 
+impl Host {
+    /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
+    pub(super) fn reconnect(&mut self) -> bool {
+        let until = Instant::now() + START;
+        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < until {
+            if let Ok(api) = UnixStream::connect(&self.socket) {
+                self.api = api;
+                self.buffer.clear();
+                self.answers.clear();
+                if self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).is_ok() {
+                    return true;
+                }
+            }
+            thread::sleep(Duration::from_millis(50));
+        }
+        false
+    }
+}
+
 /// The reason why klippy opened no API, in its last words, and what helps.
 fn no_start(folder: &Path, ended: bool) -> Trouble {
     let last_of = |name: &str| {

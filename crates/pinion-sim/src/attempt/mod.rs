@@ -294,6 +294,8 @@ impl Trial<'_> {
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
                 Ok(_) => thread::sleep(Duration::from_millis(100)),
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
                 Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
             }
         }
@@ -331,14 +333,19 @@ impl Trial<'_> {
         self.probe.axes().map(|axis| (axis.name.to_owned(), axis.lost_steps)).collect()
     }
 
-    /// The axes that lost steps since then. An axis that homes by its driver's StallGuard has to.
+    /// The axes that lost steps since then. An axis that homes by its driver's StallGuard has to, and the motors that
+    /// share its belts, too.
     fn new_lost(&self, before: &[(String, u64)]) -> Option<Outcome> {
+        let config = &self.own.config;
+        let homes_by_stall =
+            |section: &Section| section.text("endstop_pin").is_some_and(|pin| pin.trim_start().starts_with("tmc"));
+        let kinematics = self.kinematics().unwrap_or_default();
+        let on_belts =
+            |name: &str| kinematics.contains("core") && (kinematics.ends_with("xz") || !name.starts_with('z'));
+        let any = config.sections().iter().any(homes_by_stall);
         let stalls = |name: &str| {
             let sections = [format!("stepper_{name}"), name.to_owned()];
-            sections
-                .iter()
-                .filter_map(|name| self.own.config.section(name))
-                .any(|section| section.text("endstop_pin").is_some_and(|pin| pin.contains("virtual_endstop")))
+            (any && on_belts(name)) || sections.iter().filter_map(|name| config.section(name)).any(homes_by_stall)
         };
         let lost = self.lost().into_iter().zip(before).find(|((name, now), (_, then))| now > then && !stalls(name));
         lost.map(|((name, now), (_, then))| {

@@ -151,6 +151,10 @@ impl Translator<'_> {
             }
             "ads1220" => {
                 section.required("cs_pin")?;
+                if self.out.name("part", "ads1220") != "ads1220" {
+                    self.note(section, "is the second one with an ADS1220", "only the first one is simulated");
+                    return Ok(());
+                }
                 let (Some((bus, select)), Some(ready)) =
                     (self.spi(section, "cs_pin")?, self.take(section, "data_ready_pin")?)
                 else {

@@ -23,13 +23,10 @@ impl Translator<'_> {
         Ok(())
     }
 
-    /// The axis of a driver's motor. klippy refuses a driver without one.
-    fn driven(&mut self, section: &Section) -> Result<String, Trouble> {
+    /// The axis of a driver's motor. `None` if the kinematics do not use the motor.
+    fn driven(&self, section: &Section) -> Option<String> {
         let stepper = section.name.split_once(' ').map_or("", |(_, stepper)| stepper).trim();
-        self.axes.get(stepper).cloned().ok_or_else(|| {
-            let cause = format!("Could not find config section '[{stepper}]' required by tmc driver");
-            Trouble::new(cause).of(&section.place).remedy("add it, or remove the driver")
-        })
+        self.axes.get(stepper).cloned()
     }
 
     /// The pin at which a driver says that its motor stalls. The level is the chip's: a `!` too many or too few shows.
@@ -38,7 +35,7 @@ impl Translator<'_> {
     }
 
     fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
-        let axis = self.driven(section)?;
+        let Some(axis) = self.driven(section) else { return Ok(()) };
         section.required("cs_pin")?;
         let chain = section.whole("chain_length", 2)?;
         // klippy opens the bus of a chain for the first of its drivers.
@@ -70,7 +67,7 @@ impl Translator<'_> {
     }
 
     fn by_uart(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
-        let axis = self.driven(section)?;
+        let Some(axis) = self.driven(section) else { return Ok(()) };
         section.required("uart_pin")?;
         let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
         self.take_pin(section, &pin);

@@ -93,7 +93,7 @@ impl Translator<'_> {
         }
         match kind {
             "temperature_mcu" => self.mcu_thermometer(section),
-            "temperature_host" | "temperature_combined" => Ok(()),
+            "temperature_host" | "temperature_combined" | "mpc_block_temperature" | "mpc_ambient_temperature" => Ok(()),
             _ => {
                 self.heaters.insert(klippys, name.clone());
                 self.out.add("heater", entry);

@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashMap;
+
 use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
@@ -12,8 +14,8 @@ use super::translate::Translator;
 const BEFORE_ENDSTOP_MM: f64 = 15.0;
 /// How high the nozzle begins over the bed.
 const START_HEIGHT_MM: f64 = 8.0;
-/// How far motors of one z axis are apart at first, if klippy can level them.
-const TILT_MM: [f64; 4] = [0.0, 0.4, -0.3, 0.5];
+/// How far motors of one z axis are apart at first, if klippy can level them. The corners of a rectangle are in a plane.
+const TILT_MM: [f64; 4] = [0.0, 0.4, 0.1, -0.3];
 /// A motor without an end of its own.
 const FREE_MM: f64 = 1000.0;
 
@@ -272,17 +274,21 @@ impl<'a> Translator<'a> {
         self.out.set("kinematics", Entry::default().set("kind", "generic_cartesian"));
         let carriages = |kind| self.config.of_kind(kind).collect::<Vec<&Section>>();
         let all: Vec<&Section> = [carriages("carriage"), carriages("dual_carriage")].concat();
+        let mut names = HashMap::new();
         for section in all {
-            let name = section.own_name().unwrap_or_default();
-            let primary = section.text("primary_carriage").unwrap_or(name);
+            let own = section.own_name().unwrap_or_default();
+            let primary = section.text("primary_carriage").unwrap_or(own);
             let along = section.text("axis").unwrap_or(primary);
+            // The first carriage of an axis has the axis's name in a description.
+            let name = if section.kind() == "carriage" { along } else { own };
+            names.insert(own, name);
             let rail = self.travel(section)?;
             let endstop = self.endstop(section)?;
             let start = match (along, rail.at_max) {
                 ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
                 _ => rail.before_endstop(),
             };
-            let entry = Entry::default().set("name", name).set("along", along);
+            let entry = Entry::default().set("name", name);
             self.out.add("carriage", Translator::with_rail(entry, &rail, &endstop, start));
         }
         for section in self.config.of_kind("stepper") {
@@ -298,6 +304,7 @@ impl<'a> Translator<'a> {
                     None => Ok((1.0, term)),
                 }
                 .map_err(|_| section.trouble("carriages", format!("Invalid term '{term}'")).remedy("correct it"))?;
+                let carriage = names.get(carriage).copied().unwrap_or(carriage);
                 carriages.insert(carriage.to_owned(), (sign * factor).into());
             }
             self.out.add("axis", entry.set("carriages", carriages));

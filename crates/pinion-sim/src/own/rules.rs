@@ -249,9 +249,11 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
         }
         kind if kind.starts_with("tmc") && kind_of(kind) == Kind::Known => {
             let stepper = section.name.split_once(' ').map_or("", |(_, name)| name.trim());
-            if let Some(stepper) = config.section(stepper) {
-                obeyed(stepper, "microsteps", MICROSTEPS)?;
-            }
+            let Some(stepper) = config.section(stepper) else {
+                let cause = format!("Could not find config section '[{stepper}]' required by tmc driver");
+                return refused("", cause, "add it, or remove the driver");
+            };
+            obeyed(stepper, "microsteps", MICROSTEPS)?;
         }
         "safe_z_home" if has("homing_override") => {
             let cause = "homing_override and safe_z_homing cannot be used simultaneously";
