@@ -544,14 +544,14 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
             let line = request.lines().next().unwrap_or_default().to_owned();
             let body = if line.contains("fan_generic") {
                 "{\"result\":{\"status\":{\"fan_generic box\":{\"rpm\":1234.0}}}}".to_owned()
-            } else if line.contains("objects/query") {
-                format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
-            } else if line.contains("printer/info") && state != "error" {
-                "{\"result\":{\"state\":\"ready\"}}".to_owned()
             } else if line.contains("temperature_sensor") {
                 // klippy says 0 until it has a value.
                 let degrees = if std::mem::replace(&mut is_warm, true) { "21.5" } else { "0.0" };
                 format!("{{\"result\":{{\"status\":{{\"temperature_sensor bme280\":{{\"temperature\":{degrees}}}}}}}}}")
+            } else if line.contains("objects/query") {
+                format!("{{\"result\":{{\"status\":{{\"print_stats\":{{\"state\":\"{state}\"}}}}}}}}")
+            } else if line.contains("printer/info") && state != "error" {
+                "{\"result\":{\"state\":\"ready\"}}".to_owned()
             } else if line.contains("printer/info") {
                 "{\"result\":{\"state\":\"error\",\"state_message\":\"mcu 'host': Unable to connect\\nmore\"}}"
                     .to_owned()

@@ -22,6 +22,8 @@ const START_TIMEOUT: Duration = Duration::from_secs(120);
 const ANSWER_MAX: u64 = 4 << 20;
 /// How often klippy's state is asked while it starts.
 const POLL: Duration = Duration::from_millis(100);
+/// How long Moonraker may take from its start until it knows klippy's requests.
+const REGISTER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long klippy may take until it has left its old state.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(3);
 
@@ -42,11 +44,16 @@ pub(super) enum Host {
 impl Moonraker<'_> {
     /// The present state of the host.
     pub(super) fn host(&self) -> Host {
-        let answer = match self.ask("GET", "/printer/objects/query?print_stats&idle_timeout") {
-            Ok(answer) => answer,
-            // Moonraker's answer while klippy is not connected: nothing prints.
-            Err(Refused { status: Some(503), .. }) => return Host::Rests,
-            Err(Refused { why, .. }) => return Host::Unknown(why),
+        let end = Instant::now() + REGISTER_TIMEOUT;
+        let answer = loop {
+            match self.ask("GET", "/printer/objects/query?print_stats&idle_timeout") {
+                Ok(answer) => break answer,
+                // Moonraker's answer while klippy is not connected: nothing prints.
+                Err(Refused { status: Some(503), .. }) => return Host::Rests,
+                // It has just started, and does not know klippy's requests yet.
+                Err(Refused { status: Some(404), .. }) if Instant::now() < end => thread::sleep(POLL),
+                Err(Refused { why, .. }) => return Host::Unknown(why),
+            }
         };
         let status = &answer["result"]["status"];
         let is = |object: &str, states: &[&str]| {
@@ -228,6 +235,9 @@ mod tests {
             let requests = served(vec![answer], |moonraker| assert_eq!(moonraker.host(), host));
             assert_eq!(requests, ["GET /printer/objects/query?print_stats&idle_timeout"]);
         }
+        let unknown = "HTTP/1.1 404 x\r\n\r\n{\"error\":{\"message\":\"Not Found\"}}";
+        let rests = "HTTP/1.1 200 OK\r\n\r\n{\"result\":{\"status\":{}}}";
+        served(vec![unknown, rests], |moonraker| assert_eq!(moonraker.host(), Host::Rests));
         served(vec!["SSH-2.0\r\n"], |moonraker| assert!(matches!(moonraker.host(), Host::Unknown(_))));
         assert!(matches!(Moonraker("127.0.0.1:1").host(), Host::Unknown(_)));
         assert!(matches!(Moonraker("nonsense").host(), Host::Unknown(_)));

@@ -211,14 +211,15 @@ impl Link for Pty {
     }
 
     fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard> {
-        if hung_up {
-            return Ok(Heard::Gone);
+        if !hung_up {
+            self.restore();
         }
-        self.restore();
         match read(&self.master, buffer) {
-            Ok(len) => Ok(Heard::Bytes(len)),
+            // A host that stops the MCU and closes the terminal has been heard, even if this thread comes late.
+            Ok(len) if len > 0 || !hung_up => Ok(Heard::Bytes(len)),
             // The kernel answers EIO when the host has gone and all its bytes have been read.
-            Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Heard::Bytes(0)),
+            Ok(_) | Err(Errno::EIO) if hung_up => Ok(Heard::Gone),
+            Ok(_) | Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Heard::Bytes(0)),
             Err(error) => Err(error.into()),
         }
     }
@@ -377,6 +378,26 @@ mod tests {
         assert!(!hangs_up(&pty));
         drop(echo);
         assert!(hangs_up(&pty));
+        pty.part_from_host();
+        assert!(!hangs_up(&pty));
+    }
+
+    /// klippy's FIRMWARE_RESTART: it stops the MCU, and closes the terminal 30 ms later.
+    #[test]
+    fn what_a_host_has_written_before_it_went_is_read() {
+        let (_folder, mut pty, open) = terminal();
+        let mut host = open();
+        assert!(pty.meet_host());
+        host.write_all(b"stop").unwrap();
+        drop(host);
+        let mut bytes = [0; 3];
+        // The kernel moves the bytes after the hang-up, too.
+        while !hangs_up(&pty) {}
+        for (heard, text) in [(Heard::Bytes(3), "sto"), (Heard::Bytes(1), "p")] {
+            assert_eq!(pty.read(&mut bytes, true).unwrap(), heard);
+            assert!(bytes.starts_with(text.as_bytes()));
+        }
+        assert_eq!(pty.read(&mut bytes, true).unwrap(), Heard::Gone);
         pty.part_from_host();
         assert!(!hangs_up(&pty));
     }
