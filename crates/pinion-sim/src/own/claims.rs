@@ -160,7 +160,6 @@ impl Claims<'_> {
                 || kind == chip
                 || section.name.replace(' ', "_") == chip
                 || (chip == "probe" && is_probe(kind))
-                || (chip == "multi_pin" && kind == chip)
         })
     }
 
