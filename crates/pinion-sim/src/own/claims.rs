@@ -84,7 +84,7 @@ struct Claims<'a> {
     config: &'a Config,
     aliases: &'a Aliases,
     mcus: &'a [String],
-    /// The pins of [duplicate_pin_override].
+    /// The pins of `[duplicate_pin_override]`.
     free: HashSet<(String, String)>,
     claims: HashMap<(String, String), Claim>,
     /// The names that the pins of an MCU were claimed by.
