@@ -273,16 +273,21 @@ impl<'a> Translator<'a> {
     fn generic(&mut self) -> Result<(), Trouble> {
         self.out.set("kinematics", Entry::default().set("kind", "generic_cartesian"));
         let carriages = |kind| self.config.of_kind(kind).collect::<Vec<&Section>>();
-        let all: Vec<&Section> = [carriages("carriage"), carriages("dual_carriage")].concat();
+        let all: Vec<&Section> = ["carriage", "dual_carriage", "extra_carriage"].map(carriages).concat();
         let mut names = HashMap::new();
         for section in all {
             let own = section.own_name().unwrap_or_default();
-            let primary = section.text("primary_carriage").unwrap_or(own);
-            let along = section.text("axis").unwrap_or(primary);
+            let primary = section.text("primary_carriage");
+            let along = section.text("axis").or(primary.and_then(|name| names.get(name).copied())).unwrap_or(own);
             // The first carriage of an axis has the axis's name in a description.
             let name = if section.kind() == "carriage" { along } else { own };
             names.insert(own, name);
-            let rail = self.travel(section)?;
+            // An extra carriage goes where the primary one goes, and has an endstop of its own.
+            let with_travel = match primary.filter(|_| section.kind() == "extra_carriage") {
+                Some(name) => ["carriage", "dual_carriage"].map(|kind| self.config.section(&format!("{kind} {name}"))),
+                None => [Some(section), None],
+            };
+            let rail = self.travel(with_travel.into_iter().flatten().next().unwrap_or(section))?;
             let endstop = self.endstop(section)?;
             let start = match (along, rail.at_max) {
                 ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
