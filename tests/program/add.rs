@@ -458,6 +458,19 @@ fn ends_of_lines_stay_as_they_are() {
     }
 }
 
+/// The first device has ended the last line, and the second one has written behind it.
+#[test]
+fn a_device_that_goes_leaves_the_lines_of_the_next_one() {
+    let card = Card::of("Raspberry Pi 4", &[("boot/firmware/config.txt", "arm_boost=1")]);
+    card.added(&["adxl345", "--yes"]);
+    card.added(&["bme280", "--yes"]);
+    card.added(&["adxl345", "--yes", "--undo"]);
+    let config_txt = card.read("boot/firmware/config.txt");
+    assert_eq!(config_txt, "arm_boost=1\n# pinion add bme280\n[all]\ndtparam=i2c_arm=on\n");
+    card.added(&["bme280", "--yes", "--undo"]);
+    assert_eq!(card.read("boot/firmware/config.txt"), "arm_boost=1\n");
+}
+
 #[test]
 fn a_printer_cfg_that_may_not_be_changed_stays() {
     let card = Card::pi();

@@ -57,7 +57,11 @@ impl Splice {
                 _ => return Err(format!("\"{}\" is there several times: remove the right one", self.new.trim())),
             }
         };
-        text.replace_range(at..at + self.new.len(), &self.old);
+        // The last line had no end, and others have written behind ours since: their line stays one of its own.
+        let line_end = self.new.len() - self.new.trim_start_matches(['\r', '\n']).len();
+        let has_more = at + self.new.len() < text.len();
+        let kept = if has_more { line_end } else { 0 };
+        text.replace_range(at + kept..at + self.new.len(), &self.old);
         Ok(true)
     }
 }
@@ -470,6 +474,12 @@ mod tests {
         assert!(left[0].starts_with("/home/pinion/a.cfg was changed since"), "{left:?}");
         assert!(!computer.path("/home/printer.cfg.before-add-a").exists());
         assert_eq!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap(), "# mine\n[mcu]\n#*# saved\n");
+        let splice = Splice { at: 3, old: String::new(), new: "\nours\n".into() };
+        for (text, left) in [("a=b\nours\n", "a=b"), ("a=b\nours\ntheirs\n", "a=b\ntheirs\n")] {
+            let mut text = text.to_owned();
+            assert_eq!(splice.revert(&mut text), Ok(true));
+            assert_eq!(text, left);
+        }
         let splice = Splice { at: 9, old: String::new(), new: "x=1\n".into() };
         assert!(splice.revert(&mut "x=1\nx=1\n".into()).unwrap_err().contains("several times"));
         assert_eq!(splice.revert(&mut "yx=1\n".into()), Ok(false), "it is part of another line");
