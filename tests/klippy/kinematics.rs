@@ -21,7 +21,7 @@ fn stepper(section: &str, pins: &str, keys: &str) -> String {
 fn start(checkout: &Path, board: String, sections: String) -> Printer {
     let mcus = |printed: String| {
         let end = printed.find("\n[virtual_sdcard]").unwrap();
-        let mcus = printed[..end].replace("serial:", "restart_method: command\nserial:");
+        let mcus = &printed[..end];
         format!("{mcus}\n[force_move]\nenable_force_move: True\n{sections}")
     };
     Printer::start_here(checkout, |_, _| board, mcus)
