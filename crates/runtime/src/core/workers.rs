@@ -273,6 +273,7 @@ mod tests {
     use super::*;
     use pinion_firmware::mcu::{AnyJob, Oid};
     use pinion_linux::clock::Monotonic;
+    use std::fs;
     use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
 
@@ -319,23 +320,31 @@ mod tests {
         assert!(taken.is_ok());
     }
 
+    /// Whether the kernel has a thread of this process with this name asleep (proc_pid_stat(5)).
+    fn is_asleep(name: &str) -> bool {
+        let tasks = fs::read_dir("/proc/self/task").unwrap().flatten();
+        let stats = tasks.filter_map(|task| fs::read_to_string(task.path().join("stat")).ok());
+        // The kernel keeps 15 bytes of a name.
+        let state = format!("({}) S ", &name[..name.len().min(15)]);
+        stats.into_iter().any(|stat| stat.contains(&state))
+    }
+
     /// How often a worker reads its clock after it got a job, until it sleeps.
     fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
         let clock = Arc::new(Looks::default());
         let heartbeat = Heartbeat::new(Monotonic::start()).unwrap();
         let mut threads =
             Threads::new(Arc::default(), Arc::new(|| ()), clock.clone(), heartbeat, Recording::of_a_test(), may_poll);
-        let worker = threads.start("spi0").unwrap();
-        // It reads the clock once when it falls asleep.
+        let name = format!("looks {holds} {may_poll}");
+        let worker = threads.start(&name).unwrap();
+        // It reads the clock once when it falls asleep. A thread that polls is never asleep, however busy the computer is.
         let asleep = || {
-            let mut before = 0;
             loop {
-                thread::sleep(Duration::from_millis(50));
                 let looks = clock.0.load(Ordering::Relaxed);
-                if looks == before {
+                if is_asleep(&name) && clock.0.load(Ordering::Relaxed) == looks {
                     return looks;
                 }
-                before = looks;
+                thread::sleep(Duration::from_millis(1));
             }
         };
         let before = asleep();
