@@ -44,9 +44,9 @@ fn a_line_is_written_within_20_us() {
     assert!(each < Duration::from_micros(20), "{each:?}");
 }
 
-#[test]
-fn a_sleeper_wakes_within_200_us() {
-    let mut late: Vec<Duration> = Vec::new();
+/// How late the latest of 100 sleeps ends.
+fn latest_wake() -> Duration {
+    let mut latest = Duration::ZERO;
     for _ in 0..100 {
         let now = Duration::from(clock_gettime(ClockId::CLOCK_MONOTONIC).expect("the clock"));
         let deadline = now + Duration::from_millis(1);
@@ -57,10 +57,15 @@ fn a_sleeper_wakes_within_200_us() {
         )
         .expect("a sleep");
         let woken = Duration::from(clock_gettime(ClockId::CLOCK_MONOTONIC).expect("the clock"));
-        late.push(woken - deadline);
+        latest = latest.max(woken - deadline);
     }
-    late.sort();
-    // A few may coincide with work of the kernel, such as that of the start.
-    println!("the latest of 100 wakes {:?} late, the sixth latest {:?}", late[99], late[94]);
-    assert!(late[94] < Duration::from_micros(200), "{late:?}");
+    latest
+}
+
+#[test]
+fn a_sleeper_wakes_within_200_us() {
+    // The least of several: a wake-up may meet other work of the kernel.
+    let latest = (0..5).map(|_| latest_wake()).min().expect("five measurements");
+    println!("the latest of 100 wakes {latest:?} late");
+    assert!(latest < Duration::from_micros(200), "{latest:?}");
 }
