@@ -272,7 +272,7 @@ fn undo(
 ) -> Result<(), String> {
     let names: Vec<&str> = catalog.devices.iter().map(|device| device.name).collect();
     let mut sides = vec![system(computer)];
-    match printer::find(computer, args.config.as_deref()).and_then(|path| Printer::read(computer, &path)) {
+    match Printer::find(computer, args.config.as_deref()) {
         Ok(printer) => sides.push(host(computer, &printer)),
         Err(why) if args.config.is_some() => return Err(why),
         Err(why) => report.line(why),
@@ -366,8 +366,7 @@ struct Work<'a> {
 
 impl Work<'_> {
     fn run(&mut self) -> Result<(), String> {
-        let printer = printer::find(self.computer, self.args.config.as_deref());
-        let printer = printer.and_then(|path| Printer::read(self.computer, &path));
+        let printer = Printer::find(self.computer, self.args.config.as_deref());
         let (printer, no_printer) = match printer {
             Ok(printer) => (Some(printer), None),
             Err(why) if self.args.config.is_some() => return Err(why),
@@ -771,11 +770,11 @@ impl Work<'_> {
         Ok(())
     }
 
-    /// What the host measures with the device, in words.
+    /// The host's first measurement with the device, in words.
     fn first_value(&self, moonraker: &Moonraker) -> Result<String, String> {
         let section = &self.device.section;
         if self.device.resonance {
-            let lines = moonraker.run(&format!("ACCELEROMETER_QUERY%20CHIP={section}"))?;
+            let lines = moonraker.run(&format!("ACCELEROMETER_QUERY CHIP={section}"))?;
             let values = lines.iter().find_map(|line| acceleration(line));
             return values.ok_or_else(|| "ACCELEROMETER_QUERY answers no values: see klippy.log".to_owned())?;
         }
@@ -783,7 +782,7 @@ impl Work<'_> {
             return turns(moonraker, section, fan);
         }
         if let Some(strip) = section.strip_prefix("neopixel ") {
-            moonraker.run(&format!("SET_LED%20LED={strip}%20RED=0.5%20GREEN=0%20BLUE=0"))?;
+            moonraker.run(&format!("SET_LED LED={strip} RED=0.5 GREEN=0 BLUE=0"))?;
             let told = "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
                         dark, check its 5 V, its ground, and that the wire goes to DIN";
             return Ok(told.into());
@@ -796,7 +795,7 @@ impl Work<'_> {
             };
         }
         if let Some(command) = &self.device.measure {
-            let lines = moonraker.run(&command.replace(' ', "%20").replace('"', "%22"))?;
+            let lines = moonraker.run(command)?;
             let lines: Vec<&str> = lines.iter().map(|line| line.trim_start_matches("// ")).collect();
             return Ok(format!("{command}: {}", lines.join("; ")));
         }
@@ -847,7 +846,7 @@ fn temperature(moonraker: &Moonraker, section: &str) -> Result<f64, String> {
 
 /// Lets a fan run at full speed until its tachometer counts.
 fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, String> {
-    let speed = |speed: &str| moonraker.run(&format!("SET_FAN_SPEED%20FAN={fan}%20SPEED={speed}"));
+    let speed = |speed: &str| moonraker.run(&format!("SET_FAN_SPEED FAN={fan} SPEED={speed}"));
     let end = Instant::now() + SPIN_UP;
     speed("1")?;
     let counted = loop {

@@ -27,6 +27,11 @@ const REGISTER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long klippy may take until it has left its old state.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(3);
 
+/// A command or a section's name in a URL.
+fn encoded(text: &str) -> String {
+    text.replace(' ', "%20").replace('"', "%22")
+}
+
 /// A Moonraker.
 pub(super) struct Moonraker<'a>(pub(super) &'a str);
 
@@ -109,7 +114,8 @@ impl Moonraker<'_> {
         };
         let told = || self.ask("GET", "/server/gcode_store?count=50").map(|store| lines(&store));
         let before = told().map_err(|refused| refused.why)?;
-        self.ask("POST", &format!("/printer/gcode/script?script={command}")).map_err(|refused| refused.why)?;
+        let run = format!("/printer/gcode/script?script={}", encoded(command));
+        self.ask("POST", &run).map_err(|refused| refused.why)?;
         let after = told().map_err(|refused| refused.why)?;
         Ok(after.into_iter().filter(|line| !before.contains(line)).map(|(_, line)| line).collect())
     }
@@ -120,7 +126,7 @@ impl Moonraker<'_> {
     ///
     /// One line: Moonraker's words, or there is none.
     pub(super) fn value(&self, section: &str, key: &str) -> Result<f64, String> {
-        let query = format!("/printer/objects/query?{}", section.replace(' ', "%20"));
+        let query = format!("/printer/objects/query?{}", encoded(section));
         let answer = self.ask("GET", &query).map_err(|refused| refused.why)?;
         let value = answer["result"]["status"][section][key].as_f64();
         value.ok_or_else(|| format!("klippy has no {key} of [{section}]"))

@@ -106,12 +106,28 @@ fn link_to(computer: &Computer, file: &Path) -> Option<PathBuf> {
 }
 
 impl Printer {
-    /// Reads it, with the files that it includes. A file that cannot be read, such as another user's, does not count.
+    /// Finds printer.cfg as [`find`] does, and reads it. klippy may name a file by a link.
+    ///
+    /// # Errors
+    ///
+    /// One line: there is none, there are several, or it cannot be read.
+    pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<Printer, String> {
+        let file = find(computer, named)?;
+        let link = named.and_then(|_| link_to(computer, &file));
+        Printer::read_as(computer, &file, link.as_deref().unwrap_or(&file))
+    }
+
+    /// Reads the file that klippy names so, with the files that it includes. A file that cannot be read, such as another
+    /// user's, does not count.
     ///
     /// # Errors
     ///
     /// One line: printer.cfg itself cannot be read, or is a link.
     pub(super) fn read(computer: &Computer, path: &Path) -> Result<Printer, String> {
+        Printer::read_as(computer, path, path)
+    }
+
+    fn read_as(computer: &Computer, path: &Path, named: &Path) -> Result<Printer, String> {
         let about = std::fs::symlink_metadata(computer.path(path));
         let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", path.display()))?;
         if about.is_symlink() {
@@ -121,9 +137,8 @@ impl Printer {
         let owner = (about.uid(), about.gid());
         let side = Side { computer, owner: Some(owner), records: PathBuf::new() };
         let text = side.read(path)?.unwrap_or_default();
-        let named = link_to(computer, path).unwrap_or_else(|| path.to_owned());
         let mut printer = Printer {
-            path: named.clone(),
+            path: named.to_owned(),
             file: path.to_owned(),
             owner,
             text,
@@ -132,7 +147,7 @@ impl Printer {
         };
         let mut files = 0;
         let text = printer.text.clone();
-        printer.take(computer, &named, &text, &mut Vec::new(), &mut files);
+        printer.take(computer, named, &text, &mut Vec::new(), &mut files);
         Ok(printer)
     }
 
@@ -482,7 +497,7 @@ mod tests {
         let error = Printer::read(&tree.computer(), Path::new(CONFIG)).unwrap_err();
         let file = "/home/pi/dotfiles/printer.cfg";
         assert!(error.ends_with(&format!("--config {file}")), "{error}");
-        let printer = Printer::read(&tree.computer(), Path::new(file)).unwrap();
+        let printer = Printer::find(&tree.computer(), Some(Path::new(file))).unwrap();
         assert!(printer.sections.contains_key("adxl345"), "{printer:?}");
         let computer = tree.computer();
         let side = Side { computer: &computer, owner: None, records: printer.folder() };

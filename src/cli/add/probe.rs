@@ -234,7 +234,7 @@ fn fixed(answer: &[u8], mask: &[u8], bits: &[u8], faults: &[Fault]) -> Result<St
     }
 }
 
-/// What all zeros or all ones mean.
+/// The meaning of all zeros or all ones.
 fn silence(bus: Kind, answer: &[u8]) -> Option<String> {
     let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
     let why = match (bus, is_all(0), is_all(0xff)) {
