@@ -15,6 +15,8 @@ use pinion_linux::gpio::FastGpio;
 use super::devices::{FAST, is_pi, is_rp1, model, pi_config};
 use super::instance::Instance;
 
+const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
+
 /// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
 struct Vpu {
     models: &'static [&'static str],
@@ -88,7 +90,7 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
     let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
     let bus = without_dma.map(|pin| {
         let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses amid a frame");
-        Finding::warning(CHECK, found, "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0")
+        Finding::warning(CHECK, found, TO_SPI)
     });
     [Some(clock), bus].into_iter().flatten().collect()
 }
@@ -107,7 +109,6 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
     const CHECK: &str = "leds";
     let refused = |why: &str, remedy: String| Finding::error(CHECK, format!("LEDs: {pin} is refused: {why}"), remedy);
     let set = |value: &str| format!("fast_gpio = \"{value}\" in {}, then {}", instance.config(), instance.restart());
-    const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
     if is_rp1(computer) {
         return refused("the RP1 is behind PCIe, which may shorten or join their pulses", TO_SPI.into());
     }

@@ -99,8 +99,13 @@ impl Host {
         };
         let mut host =
             Host { child, socket, api, buffer: Vec::new(), next_id: 0, answers: HashMap::new(), said: Vec::new() };
-        let subscribed = host.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER);
-        subscribed.map(|_| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
+        let subscribed = host.subscribe();
+        subscribed.map(|()| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
+    }
+
+    /// Has klippy send its output.
+    fn subscribe(&mut self) -> Result<(), Refused> {
+        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
     }
 
     /// A call of the API.
@@ -217,9 +222,7 @@ impl Host {
             let _ = api.write_all(b"{\"id\":1,\"method\":\"emergency_stop\"}\x03");
         }
     }
-}
 
-impl Host {
     /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
     pub(super) fn reconnect(&mut self) -> bool {
         let until = Instant::now() + START;
@@ -228,13 +231,28 @@ impl Host {
                 self.api = api;
                 self.buffer.clear();
                 self.answers.clear();
-                if self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).is_ok() {
+                if self.subscribe().is_ok() {
                     return true;
                 }
             }
             thread::sleep(Duration::from_millis(50));
         }
         false
+    }
+
+    /// Ends klippy. One that hangs is killed.
+    pub(super) fn end(&mut self) {
+        let pid = nix::unistd::Pid::from_raw(self.child.id().cast_signed());
+        let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM);
+        let until = Instant::now() + END_TIME;
+        while Instant::now() < until {
+            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
+                return;
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
     }
 }
 
@@ -259,23 +277,6 @@ fn no_start(folder: &Path, ended: bool) -> Trouble {
         format!("read {}", file.display())
     };
     Trouble::new(format!("klippy does not start: {last}")).remedy(remedy)
-}
-
-impl Host {
-    /// Ends klippy. One that hangs is killed.
-    pub(super) fn end(&mut self) {
-        let pid = nix::unistd::Pid::from_raw(self.child.id().cast_signed());
-        let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM);
-        let until = Instant::now() + END_TIME;
-        while Instant::now() < until {
-            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
-                return;
-            }
-            thread::sleep(Duration::from_millis(20));
-        }
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
 }
 
 impl Drop for Host {

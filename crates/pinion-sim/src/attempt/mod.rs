@@ -50,15 +50,22 @@ const NEAR_MM: f64 = 0.15;
 const WITHIN_MM: f64 = 0.1;
 /// How level a gantry or bed has to be.
 const LEVEL_MM: f64 = 0.1;
+/// Whether a leveling moves the motors of z apart, or only measures.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Moves {
+    Motors,
+    Nothing,
+}
+
 /// The sections that level something with a probe, in the order in which an owner uses them, and their commands.
-const LEVELS: [(&str, &str); 7] = [
-    ("bed_tilt", "BED_TILT_CALIBRATE"),
-    ("z_tilt", "Z_TILT_ADJUST"),
-    ("z_tilt_ng", "Z_TILT_ADJUST"),
-    ("quad_gantry_level", "QUAD_GANTRY_LEVEL"),
-    ("delta_calibrate", "DELTA_CALIBRATE"),
-    ("screws_tilt_adjust", "SCREWS_TILT_CALCULATE"),
-    ("bed_mesh", "BED_MESH_CALIBRATE"),
+const LEVELS: [(&str, &str, Moves); 7] = [
+    ("bed_tilt", "BED_TILT_CALIBRATE", Moves::Nothing),
+    ("z_tilt", "Z_TILT_ADJUST", Moves::Motors),
+    ("z_tilt_ng", "Z_TILT_ADJUST", Moves::Motors),
+    ("quad_gantry_level", "QUAD_GANTRY_LEVEL", Moves::Motors),
+    ("delta_calibrate", "DELTA_CALIBRATE", Moves::Nothing),
+    ("screws_tilt_adjust", "SCREWS_TILT_CALCULATE", Moves::Nothing),
+    ("bed_mesh", "BED_MESH_CALIBRATE", Moves::Nothing),
 ];
 /// Longest G-code file.
 const GCODE_MIB: u64 = 256;
@@ -159,11 +166,6 @@ const STEPS: &[Step] = &[
     Step { name: "printed", run: |trial| trial.printed() },
     Step { name: "cooled", run: |trial| trial.cooled() },
 ];
-
-/// Whether a section's command moves the motors of z apart.
-fn levels_motors(section: &Section) -> bool {
-    ["z_tilt", "z_tilt_ng", "quad_gantry_level"].contains(&section.name.as_str())
-}
 
 /// Whether a step comes before anything is homed.
 fn is_first(step: &str) -> bool {
@@ -597,8 +599,10 @@ impl Trial<'_> {
 
     fn leveled(&mut self) -> Outcome {
         let config = &self.own.config;
-        let found: Vec<_> =
-            LEVELS.iter().filter_map(|(name, command)| Some((config.section(name)?, *command))).collect();
+        let found: Vec<_> = LEVELS
+            .iter()
+            .filter_map(|(name, command, moves)| Some((config.section(name)?, *command, *moves)))
+            .collect();
         if found.is_empty() {
             return Outcome::Skipped("nothing of [z_tilt], [quad_gantry_level], [bed_mesh] is there".into());
         }
@@ -606,16 +610,17 @@ impl Trial<'_> {
             return Outcome::Skipped("there is no probe".into());
         }
         let before = self.lost();
-        for (section, command) in &found {
+        for (section, command, moves) in &found {
             if let Err(outcome) = self.gcode("G28", LONG).and_then(|()| self.gcode(command, LONG)) {
                 return outcome.at(&section.place);
             }
-            if let Some((apart, name)) = self.apart().filter(|(apart, _)| *apart > LEVEL_MM && levels_motors(section)) {
+            if let Some((apart, name)) = self.apart().filter(|(apart, _)| *apart > LEVEL_MM && *moves == Moves::Motors)
+            {
                 let cause = format!("after {command} the motor {name} holds its side {apart:.3} mm too high or low");
                 return self.failed(cause, Some(section.place.clone()));
             }
         }
-        let commands: Vec<&str> = found.iter().map(|(_, command)| *command).collect();
+        let commands: Vec<&str> = found.iter().map(|(_, command, _)| *command).collect();
         self.new_lost(&before).unwrap_or_else(|| Outcome::Passed(commands.join(", ")))
     }
 
@@ -646,8 +651,8 @@ impl Trial<'_> {
             return Outcome::Skipped("there is no [resonance_tester]".into());
         };
         let chips = ["accel_chip", "accel_chip_x", "accel_chip_y"].into_iter().filter_map(|key| section.text(key));
-        let kinds = chips.filter_map(|chip| chip.split_whitespace().next());
-        if let Some(kind) = kinds.into_iter().find(|kind| kind_of(kind) != Kind::Known) {
+        let mut kinds = chips.filter_map(|chip| chip.split_whitespace().next());
+        if let Some(kind) = kinds.find(|kind| kind_of(kind) != Kind::Known) {
             return Outcome::Skipped(format!("[{kind}] is not simulated"));
         }
         // The whole range would take four minutes.

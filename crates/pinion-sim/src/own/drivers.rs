@@ -9,6 +9,11 @@ use pinion_sim::{Tmc2209Config, Tmc5160Config};
 use super::description::Entry;
 use super::translate::Translator;
 
+/// The name of the section of a driver's motor.
+pub(super) fn motor_of(driver: &Section) -> &str {
+    driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
+}
+
 impl Translator<'_> {
     pub(super) fn drivers(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections() {
@@ -25,8 +30,7 @@ impl Translator<'_> {
 
     /// The axis of a driver's motor. `None` if the kinematics do not use the motor.
     fn driven(&self, section: &Section) -> Option<String> {
-        let stepper = section.name.split_once(' ').map_or("", |(_, stepper)| stepper).trim();
-        self.axes.get(stepper).cloned()
+        self.axes.get(motor_of(section)).cloned()
     }
 
     /// The pin at which a driver says that its motor stalls. The level is the chip's: a `!` too many or too few shows.

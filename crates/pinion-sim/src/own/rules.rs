@@ -6,6 +6,7 @@
 
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
+use super::drivers::motor_of;
 use super::known::{Kind, kind_of};
 
 /// The value of an option.
@@ -248,7 +249,7 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
             section.required("serial")?;
         }
         kind if kind.starts_with("tmc") && kind_of(kind) == Kind::Known => {
-            let stepper = section.name.split_once(' ').map_or("", |(_, name)| name.trim());
+            let stepper = motor_of(section);
             let Some(stepper) = config.section(stepper) else {
                 let cause = format!("Could not find config section '[{stepper}]' required by tmc driver");
                 return refused("", cause, "add it, or remove the driver");
@@ -261,8 +262,8 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
         }
         "heater_fan" => {
             for heater in section.list("heater", ',') {
-                let named = config.sections().iter().filter(|other| other.text("heater_pin").is_some());
-                if !named.into_iter().any(|other| other.own_name().unwrap_or(&other.name) == heater) {
+                let mut named = config.sections().iter().filter(|other| other.text("heater_pin").is_some());
+                if !named.any(|other| other.own_name().unwrap_or(&other.name) == heater) {
                     return refused("heater", format!("Unknown heater '{heater}'"), "name a heater of this printer");
                 }
             }

@@ -7,16 +7,14 @@
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Write as _;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use super::physics::Lamp;
-use super::wire::{Kind, Wire};
+use super::wire::LevelLine;
 use crate::description::buses::SpiBusConfig;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
-use pinion_firmware::time::Clock;
 use pinion_firmware::trouble::Trouble;
 
 /// A chip as its data sheet describes it. The calls come in the order of the signals: selected, bytes, deselected.
@@ -47,39 +45,11 @@ pub(crate) trait MosiListener: Send {
 /// The end of the name of a bus's data input as a pin.
 pub(crate) const MISO: &str = "/miso";
 
-/// A line that selects a chip while the line is low.
-pub(crate) struct SelectLine {
-    /// The name of the chip.
-    chip: String,
-    low: AtomicBool,
-}
-
-impl SelectLine {
-    /// The line of a chip, at its idle level.
-    pub(crate) fn new(chip: &str) -> SelectLine {
-        SelectLine { chip: chip.to_owned(), low: AtomicBool::new(false) }
-    }
-}
-
-impl Wire for SelectLine {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("chip select of {}", self.chip)
-    }
-
-    fn drive(&self, on: bool, _at: Clock) {
-        self.low.store(!on, Ordering::Relaxed);
-    }
-}
-
 /// A chip's place on its bus, or that of a chain of chips.
 struct Socket {
     name: String,
     /// `None` for the only chip of a bus, which is always selected.
-    select: Option<Arc<SelectLine>>,
+    select: Option<Arc<LevelLine>>,
     /// In a chain each chip gets the bytes that leave the one before it.
     chips: Vec<Box<dyn SpiChip>>,
 }
@@ -180,30 +150,31 @@ impl SpiBus {
     }
 
     /// Puts a chip on the bus.
-    pub(crate) fn solder(&mut self, name: String, select: Option<Arc<SelectLine>>, chip: Box<dyn SpiChip>) {
+    pub(crate) fn solder(&mut self, name: String, select: Option<Arc<LevelLine>>, chip: Box<dyn SpiChip>) {
         let wires = self.wires.get_mut().unwrap_or_else(PoisonError::into_inner);
         wires.sockets.push(Socket { name, select, chips: vec![chip] });
     }
 
-    /// Puts a chip at a place of the chain with this name, counted from 0. `select` makes the line of a new chain.
+    /// Puts a chip at a place of the chain with this name, counted from 0. Returns the select line of a new chain.
     pub(crate) fn solder_in_chain(
         &mut self,
         name: &str,
         (place, length): (usize, usize),
-        select: impl FnOnce() -> Arc<SelectLine>,
         chip: Box<dyn SpiChip>,
-    ) {
+    ) -> Option<Arc<LevelLine>> {
         let wires = self.wires.get_mut().unwrap_or_else(PoisonError::into_inner);
         let known = wires.sockets.iter().position(|socket| socket.name == name);
-        let at = known.unwrap_or_else(|| {
-            wires.sockets.push(Socket { name: name.to_owned(), select: Some(select()), chips: Vec::new() });
-            wires.sockets.len() - 1
-        });
+        let new = known.is_none().then(|| Arc::new(LevelLine::chip_select(name)));
+        let at = known.unwrap_or(wires.sockets.len());
+        if new.is_some() {
+            wires.sockets.push(Socket { name: name.to_owned(), select: new.clone(), chips: Vec::new() });
+        }
         let chips = &mut wires.sockets[at].chips;
         while chips.len() < length {
             chips.push(Box::new(Shift([0; 5])));
         }
         chips[place] = chip;
+        new
     }
 
     /// Puts a listener on the data output alone.
@@ -215,7 +186,7 @@ impl SpiBus {
     fn transfer(&self, mode: u8, rate_hz: u32, bytes: &mut [u8]) -> Result<(), BusError> {
         let mut wires = self.wires.lock().unwrap_or_else(PoisonError::into_inner);
         let Wires { sockets, listeners, trace } = &mut *wires;
-        let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| line.low.load(Ordering::Relaxed));
+        let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| !line.is_high());
         let mut chips: Vec<&mut Socket> =
             sockets.iter_mut().filter(|socket| is_selected(socket) && socket.knows_mode(mode)).collect();
         let sent = bytes.to_vec();

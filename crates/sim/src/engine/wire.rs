@@ -344,13 +344,25 @@ impl Wire for EnablePin {
     }
 }
 
-/// A line that parts read.
-#[derive(Default)]
-pub(crate) struct LevelLine(AtomicBool);
+/// A line whose level selects parts.
+pub(crate) struct LevelLine {
+    description: String,
+    high: AtomicBool,
+}
 
 impl LevelLine {
+    /// The select line of a chip, at its idle level.
+    pub(crate) fn chip_select(chip: &str) -> LevelLine {
+        LevelLine { description: format!("chip select of {chip}"), high: AtomicBool::new(true) }
+    }
+
+    /// A line that connects UARTs to their wire.
+    pub(crate) fn uart_select() -> LevelLine {
+        LevelLine { description: "select line of UARTs".into(), high: AtomicBool::new(false) }
+    }
+
     pub(crate) fn is_high(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+        self.high.load(Ordering::Relaxed)
     }
 }
 
@@ -360,11 +372,11 @@ impl Wire for LevelLine {
     }
 
     fn describe(&self) -> String {
-        "select line of UARTs".to_owned()
+        self.description.clone()
     }
 
     fn drive(&self, on: bool, _at: Clock) {
-        self.0.store(on, Ordering::Relaxed);
+        self.high.store(on, Ordering::Relaxed);
     }
 }
 

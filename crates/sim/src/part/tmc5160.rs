@@ -77,9 +77,9 @@ const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
 /// are values of a common motor: the data sheet gives no formula.
 const SG_FREE: i32 = 200;
 const SG_FALL: i32 = 300;
+const SG_PER_SGT: i32 = 10;
 /// Longest chain of drivers.
 const CHAIN_MAX: usize = 32;
-const SG_PER_SGT: i32 = 10;
 
 use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
 

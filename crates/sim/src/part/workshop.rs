@@ -15,7 +15,7 @@ use crate::engine::motion::{Axis, Rail};
 use crate::engine::noise::Noise;
 use crate::engine::physics::Heater;
 use crate::engine::serial::{SerialChip, SerialWire};
-use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
+use crate::engine::spi::{MosiListener, SpiBus, SpiChip};
 use crate::engine::wire::{ControllerPin, Kind, LevelLine, Wire, WiredPin};
 use crate::engine::world::{Sight, World};
 use crate::klippy::layout::Layout;
@@ -173,20 +173,13 @@ impl Workshop<'_> {
         let Some(Socket::Spi { bus, select_pin }) = part.socket() else { return };
         if let (Some(place), Some(pin)) = (part.chain(), select_pin) {
             let name = format!("chain at {}", pin.name);
-            let line = Arc::new(SelectLine::new(&name));
             let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) else { return };
-            let mut is_new = false;
-            let select = || {
-                is_new = true;
-                line.clone()
-            };
-            bus.solder_in_chain(&name, place, select, Box::new(chip));
-            if is_new {
+            if let Some(line) = bus.solder_in_chain(&name, place, Box::new(chip)) {
                 self.wire_shared(Some(pin), line);
             }
             return;
         }
-        let select = select_pin.map(|_| Arc::new(SelectLine::new(&part.name())));
+        let select = select_pin.map(|_| Arc::new(LevelLine::chip_select(&part.name())));
         if let Some(line) = &select {
             self.pins.extend(select_pin.map(|pin| WiredPin::new(pin, line.clone())));
         }
@@ -201,7 +194,7 @@ impl Workshop<'_> {
         for pin in part.select_pins() {
             let known = self.levels.iter().find(|(name, _)| *name == pin.name).map(|(_, line)| line.clone());
             let line = known.unwrap_or_else(|| {
-                let line = Arc::new(LevelLine::default());
+                let line = Arc::new(LevelLine::uart_select());
                 self.levels.push((pin.name.clone(), line.clone()));
                 self.wire_shared(Some(&PinName { name: pin.name.clone(), inverted: false }), line.clone());
                 line
