@@ -4,6 +4,10 @@ export DEBIAN_FRONTEND=noninteractive
 ROOT=/run/chroot
 inside() { chroot $ROOT /usr/bin/env PATH="$PATH" "$@" </dev/null; }
 apt-get -qq purge -y pinion-mcu pinion-sim
+# The configuration of an instance is its owner's, and stays.
+configured() { find /etc/pinion 2>/dev/null | sort; }
+not grep -q 'pinion\.toml' <(configured)
+before=$(configured)
 cp /share/pinion-mcu.deb /share/pinion-sim.deb /srv/
 mkdir $ROOT
 mount --bind / $ROOT
@@ -21,7 +25,7 @@ not is_active pinion-mcu
 # A program that looks at the computer ends, too.
 (inside pinion doctor || true) | grep service
 inside apt-get purge -y pinion-mcu pinion-sim
-[ ! -e /etc/pinion ]
+is "$(configured)" "$before" "what is left in /etc/pinion"
 [ ! -L $ROOT/etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
 umount $ROOT
 rmdir $ROOT
