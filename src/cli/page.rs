@@ -7,7 +7,9 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::{self, Display, Write as _};
+use std::fs::File;
 use std::io::{self, Write as _};
+use std::os::fd::{AsFd, BorrowedFd};
 
 use pinion_linux::foreign::{plain, plain_json};
 
@@ -82,15 +84,34 @@ pub fn print(page: &Page) -> Result<(), String> {
 /// Writes text on stdout that moves the cursor and paints. The names in it come from a page or from [`plain`].
 pub fn draw(text: &str) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    out.write_all(text.as_bytes())?;
-    out.flush()
+    out.flush()?;
+    write_at_once(out.as_fd(), text)
+}
+
+/// Writes all of it in one call, as far as the reader takes it. The standard library's stdout makes a call for the text up
+/// to the last newline and another for the rest. A line of the log between the two would be written where the picture is
+/// drawn, because the log is written by another thread.
+fn write_at_once(out: BorrowedFd, text: &str) -> io::Result<()> {
+    File::from(out.try_clone_to_owned()?).write_all(text.as_bytes())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::net::UnixDatagram;
+
     use super::*;
     use pinion_testkit::names::{any_name, assert_plain};
     use proptest::prelude::*;
+
+    #[test]
+    fn a_picture_is_written_in_one_call() {
+        // Each call is a datagram.
+        let (out, reader) = UnixDatagram::pair().unwrap();
+        let text = format!("\n\n{}\n\x1b[2;1Hend", "x".repeat(3000));
+        write_at_once(out.as_fd(), &text).unwrap();
+        let mut read = [0; 4000];
+        assert_eq!(reader.recv(&mut read).unwrap(), text.len());
+    }
 
     #[test]
     fn a_table_has_room_for_the_longest_cell() {

@@ -17,7 +17,7 @@ use pinion_protocol::block::{Sequence, frame};
 use pinion_protocol::vlq::Writer;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX, as_nobody, pinion_path};
+use crate::process::{Pinion, WAIT_MAX, as_nobody, pinion_path, program};
 use crate::terminal::AtTerminal;
 
 /// A member of the terminal's group that has it open.
@@ -244,7 +244,7 @@ fn standard_input_and_output_are_given_back_as_they_were() {
     let folder = tempfile::tempdir().unwrap();
     for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT, Signal::SIGALRM, Signal::SIGXCPU] {
         let log = folder.path().join(signal.as_str());
-        let mut command = Command::new(pinion_path());
+        let mut command = program();
         command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
         let mut program = AtTerminal::start(&mut command, 24, Some(File::create(&log).unwrap().into()));
         program.wait_for("the program", |_| fs::read_to_string(&log).unwrap().contains("serving on").then_some(()));
