@@ -317,6 +317,25 @@ fn a_finished_block_has_its_responses() {
 }
 
 #[test]
+fn no_response_comes_before_a_published_answer_that_it_outdates() {
+    let start = || {
+        let progress = Progress::default();
+        progress.publish(1);
+        (progress, words::<1>())
+    };
+    model(
+        "publish",
+        start,
+        |(progress, responses)| {
+            progress.withdraw();
+            responses[0].store(1, Ordering::Release);
+        },
+        |(progress, responses)| (responses[0].load(Ordering::Acquire), progress.published()),
+        |_, (), seen| assert_ne!(seen, (1, 1), "the answer is older than the response before it"),
+    );
+}
+
+#[test]
 fn a_stop_request_in_the_ring_is_counted() {
     model(
         "stops",

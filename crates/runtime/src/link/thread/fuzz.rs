@@ -144,7 +144,16 @@ impl Bench {
         let (response_ring, reader) = response_ring(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
         let (parker, ledger) = (Arc::default(), Ledger::default());
-        let end = CoreEnd { requests, parker, reader, progress: progress.clone(), wake, ledger, may_poll: false };
+        let end = CoreEnd {
+            requests,
+            parker,
+            reader,
+            progress: progress.clone(),
+            wake,
+            ledger,
+            asked_at: None,
+            may_poll: false,
+        };
         let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *heartbeat);
         let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil).expect("epoll");
         let handshake = Handshake::of(dialect.clone());
