@@ -10,6 +10,7 @@ use crate::heartbeat::{JobSlot, SharedHeartbeat};
 use crate::progress::Progress;
 use crate::ring::{self, Found, Ring};
 use crate::seqlock::Seqlock;
+use crate::sleep_flag::SleepFlag;
 use crate::watch::Watch;
 
 /// Runs a model, and prints in how many orders. `one` and `other` share what `start` makes, and `check` sees what both
