@@ -3,7 +3,9 @@
 
 #![forbid(unsafe_code)]
 
+use std::env;
 use std::fmt::Write as _;
+use std::fs;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -75,7 +77,25 @@ fn report(halves: &[Half; 2], verdict: &Verdict) -> String {
         let _ = writeln!(text, "{name}:\n  wake-ups  {wakeup}\n  edges     {edge}  (margin {:.1} us)", us(*margin));
     }
     let _ = writeln!(text, "verdict: {verdict}");
-    text
+    text + &share(halves, &computer_name())
+}
+
+/// One line with the figures, to paste into a discussion. docs/develop/performance.md uses the same names.
+fn share(halves: &[Half; 2], computer: &str) -> String {
+    let late = halves.each_ref().map(|Half { name, edge, .. }| {
+        let late_us = |late| format!("{:.1}", us(late));
+        let [p50, p999] = [0.5, 0.999].map(|share| late_us(edge.quantile(share)));
+        format!("{name} {p50} / {p999} / {}", late_us(edge.max()))
+    });
+    let version = env!("CARGO_PKG_VERSION");
+    format!("to share: Pinion {version} on {computer}: edges late, us: p50 / p99.9 / max: {}\n", late.join(", "))
+}
+
+/// The computer's model and kernel.
+fn computer_name() -> String {
+    let model = fs::read_to_string("/proc/device-tree/model").unwrap_or_else(|_| env::consts::ARCH.to_owned());
+    let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    format!("{}, Linux {}", model.trim_end_matches('\0'), kernel.trim())
 }
 
 const WIDTH: f64 = 860.0;
@@ -170,6 +190,15 @@ mod tests {
         let mut edge = Lateness::default();
         late.iter().for_each(|late| edge.record(Ticks(*late)));
         Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
+    }
+
+    #[test]
+    fn a_line_to_share_has_the_figures_and_the_computer() {
+        let late: Vec<u32> = (1..=1000).map(|us| 50 * us / 100).collect();
+        let line = share(&[half("idle", &late), half("under load", &[50])], "a board, Linux 6.1");
+        let start = format!("to share: Pinion {} on a board, Linux 6.1: edges late, us", env!("CARGO_PKG_VERSION"));
+        assert!(line.starts_with(&start), "{line}");
+        assert!(line.ends_with(": idle 5.1 / 10.0 / 10.0, under load 1.0 / 1.0 / 1.0\n"), "{line}");
     }
 
     #[test]

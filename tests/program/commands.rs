@@ -340,7 +340,7 @@ fn latency_judges_the_computer() {
         let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
         let text = String::from_utf8(measured.stdout).unwrap();
         assert!(measured.status.success(), "{text}");
-        for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: "] {
+        for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: ", "to share: Pinion "] {
             assert!(text.contains(part), "no \"{part}\" in:\n{text}");
         }
     });

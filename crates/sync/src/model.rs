@@ -10,6 +10,7 @@ use crate::heartbeat::{JobSlot, SharedHeartbeat};
 use crate::progress::Progress;
 use crate::ring::{self, Found, Ring};
 use crate::seqlock::Seqlock;
+use crate::sleep_flag::SleepFlag;
 use crate::watch::Watch;
 
 /// Runs a model, and prints in how many orders. `one` and `other` share what `start` makes, and `check` sees what both
@@ -313,6 +314,25 @@ fn a_finished_block_has_its_responses() {
         },
         |(progress, responses)| (progress.done(), responses[0].load(Ordering::Acquire)),
         |_, (), (done, responses)| assert!(responses >= done, "an acknowledgement is ahead of its response"),
+    );
+}
+
+#[test]
+fn no_response_comes_before_a_published_answer_that_it_outdates() {
+    let start = || {
+        let progress = Progress::default();
+        progress.publish(1);
+        (progress, words::<1>())
+    };
+    model(
+        "publish",
+        start,
+        |(progress, responses)| {
+            progress.withdraw();
+            responses[0].store(1, Ordering::Release);
+        },
+        |(progress, responses)| (responses[0].load(Ordering::Acquire), progress.published()),
+        |_, (), seen| assert_ne!(seen, (1, 1), "the answer is older than the response before it"),
     );
 }
 

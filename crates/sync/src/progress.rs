@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How far the core has come with the host's blocks.
 
-use crate::atomic::{AtomicBool, AtomicU32, Ordering, fence};
+use crate::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 
 /// How many of the host's blocks the core has begun and finished. Also how many stop requests the link has handed to
 /// it. The counts wrap around.
@@ -15,6 +15,8 @@ pub struct Progress {
     begun: AtomicU32,
     done: AtomicU32,
     held: AtomicBool,
+    /// Nonzero while it holds: see [`Progress::publish`].
+    config: AtomicU64,
     stops_handed: AtomicU32,
 }
 
@@ -37,6 +39,25 @@ impl Progress {
     /// How many blocks are done. After this the link sees all responses to them.
     pub fn done(&self) -> u32 {
         self.done.load(Ordering::Acquire)
+    }
+
+    /// The core publishes its answer to `get_config`, before it finishes a block. 0: only the core can answer now. The word
+    /// holds until the core sends its next response: a timer may have stopped the MCU by then.
+    pub fn publish(&self, config: u64) {
+        self.config.store(config, Ordering::Relaxed);
+    }
+
+    /// The core is about to send a response. So whoever sees the response does not see an older answer.
+    pub fn withdraw(&self) {
+        if self.config.load(Ordering::Relaxed) != 0 {
+            self.config.store(0, Ordering::Relaxed);
+        }
+    }
+
+    /// The core's published answer, or 0. The caller has seen with [`Progress::done`] that the core has no block, and
+    /// then has taken all responses.
+    pub fn published(&self) -> u64 {
+        self.config.load(Ordering::Relaxed)
     }
 
     /// Notes whether a bus holds the core's block back from now on. After this the core looks for further blocks before

@@ -3,7 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -12,6 +11,8 @@ use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::pins::{Names, line_number};
 use pinion_linux::sysfs::Sysfs;
 use pinion_linux::{Inventory, LinuxBoard};
+
+use super::computer_name;
 
 /// How long each of the two ways is measured.
 const SPAN: Duration = Duration::from_secs(1);
@@ -47,9 +48,7 @@ pub(super) fn measure(name: &str, wish: FastGpio) -> Result<String, String> {
         text += &format!("  {way:<9}  {}\n", cost?);
         text += hidden(&*claimed.line);
     }
-    let model = fs::read_to_string("/proc/device-tree/model").unwrap_or_else(|_| "no device tree".to_owned());
-    let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    Ok(text + &format!("on {}, Linux {}\n", model.trim_end_matches('\0'), kernel.trim()))
+    Ok(text + &format!("on {}\n", computer_name()))
 }
 
 /// The limits of the measurement of this line.

@@ -70,14 +70,23 @@ impl Program {
     /// The measured program, in real time: Pinion, or the program from the computer's `--program`, which takes the
     /// options of Klipper's program.
     pub fn measured() -> Program {
+        Program::measured_with(&["-r"])
+    }
+
+    /// The same without `-r`.
+    pub fn measured_in_ordinary_time() -> Program {
+        Program::measured_with(&[])
+    }
+
+    fn measured_with(args: &[&str]) -> Program {
         match other() {
             Some(words) => {
                 let mut words = words.split_whitespace();
                 let mut command = Command::new(words.next().expect("a program"));
-                command.args(words).arg("-r");
+                command.args(words).args(args);
                 Program::spawn(command).ready()
             }
-            None => Program::start(),
+            None => Program::with(args, &[]),
         }
     }
 
@@ -144,6 +153,16 @@ impl Program {
     pub fn cpu_time(&self) -> Duration {
         let of = |process| clock_getcpuclockid(process).and_then(clock_gettime).expect("a running program");
         self.processes().map(|process| Duration::from(of(process))).sum()
+    }
+
+    /// Its memory in RAM. Processes that share a page each count their part of the page.
+    pub fn memory_kb(&self) -> u64 {
+        let of = |process: Pid| {
+            let text = sysfs::read(format!("/proc/{process}/smaps_rollup"));
+            let share = text.lines().find_map(|line| line.strip_prefix("Pss:")?.trim().strip_suffix(" kB"));
+            share.and_then(|number| number.trim().parse::<u64>().ok()).expect("a share of the memory")
+        };
+        self.processes().map(of).sum()
     }
 
     /// How often its threads have gone to sleep so far. Each time, another thread or an interrupt wakes them.

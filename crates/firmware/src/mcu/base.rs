@@ -95,6 +95,30 @@ response! {
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
 }
+
+impl Config {
+    const KNOWN: u64 = 1 << 63;
+    const IS_CONFIG: u64 = 1 << 62;
+    const IS_SHUTDOWN: u64 = 1 << 61;
+
+    /// It as a word that is not 0.
+    pub fn word(&self) -> u64 {
+        let flag = |is_set, bit| if is_set { bit } else { 0 };
+        let flags = Self::KNOWN | flag(self.is_config, Self::IS_CONFIG) | flag(self.is_shutdown, Self::IS_SHUTDOWN);
+        flags | u64::from(self.move_count) << 32 | u64::from(self.crc)
+    }
+
+    /// The answer that [`Config::word`] made this word of.
+    pub fn of_word(word: u64) -> Option<Config> {
+        (word & Self::KNOWN != 0).then_some(Config {
+            is_config: word & Self::IS_CONFIG != 0,
+            crc: word as u32,
+            is_shutdown: word & Self::IS_SHUTDOWN != 0,
+            move_count: (word >> 32) as u16,
+        })
+    }
+}
+
 response! {
     /// The MCU has started and waits for its configuration.
     "starting"
@@ -153,13 +177,7 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu: &mut Mcu| {
 .allowed_in_shutdown();
 
 const GET_CONFIG: Command = command!("get_config", |mcu: &mut Mcu| {
-    let config = Config {
-        is_config: mcu.is_finalized(),
-        // klippy resets an MCU with another configuration before it sends anything else.
-        crc: if mcu.state.wire.is_foreign() { !mcu.state.phase.crc() } else { mcu.state.phase.crc() },
-        is_shutdown: mcu.is_shutdown(),
-        move_count: mcu.state.moves.count(),
-    };
+    let config = mcu.config();
     mcu.state.wire.send(config);
     Ok(())
 })

@@ -5,6 +5,7 @@
 
 use crate::shutdown::Shutdown;
 
+use super::base::Config;
 use super::{Mcu, Note, TimerId};
 
 impl Mcu {
@@ -17,6 +18,18 @@ impl Mcu {
     /// Whether the configuration is complete.
     pub fn is_finalized(&self) -> bool {
         self.state.phase.is_finalized()
+    }
+
+    /// The answer to `get_config`.
+    pub fn config(&self) -> Config {
+        let state = &self.state;
+        Config {
+            is_config: self.is_finalized(),
+            // klippy resets an MCU with another configuration before it sends anything else.
+            crc: if state.wire.is_foreign() { !state.phase.crc() } else { state.phase.crc() },
+            is_shutdown: self.is_shutdown(),
+            move_count: state.moves.count(),
+        }
     }
 
     pub(super) fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {

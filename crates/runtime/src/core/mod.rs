@@ -385,6 +385,8 @@ impl Core {
         if self.progress.stops_handed() != self.stops_taken && self.mcu.is_emergency(bytes) {
             self.stops_taken = self.stops_taken.wrapping_add(1);
         }
+        // A send that is under way may still stop the MCU, and `get_config` comes after it.
+        self.progress.publish(if self.mcu.is_held() { 0 } else { self.mcu.config().word() });
         self.progress.finish();
         // The end of the next block is early enough, if that block may begin. But an MCU that is being configured takes
         // its time for a block.
@@ -733,8 +735,10 @@ mod tests {
         rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
         rig.wait_until("the core has seen the block behind them", |rig| rig.progress.is_held());
         assert!(!rig.bench.level(30) && rig.progress.done() == CONFIGURATION + 3);
+        assert_eq!(rig.progress.published(), 0, "get_config comes after what is sent");
         rig.bench.hang(false);
         rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 4);
+        assert_ne!(rig.progress.published(), 0);
         assert!(rig.bench.level(30));
         let sent: Vec<_> = rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect();
         assert_eq!(sent, [[0], [1], [2]]);

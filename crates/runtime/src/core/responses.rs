@@ -138,6 +138,7 @@ impl Outbox for ResponseWriter {
         let mut head = [0; HEAD_BYTES];
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
         head[2..].copy_from_slice(&self.progress.begun().to_le_bytes());
+        self.progress.withdraw();
         // If the host does not read, the ring fills up, and responses are dropped, as in the firmware.
         push(&mut self.responses, &head, payload);
         self.wake.wake();

@@ -97,6 +97,6 @@ impl CoreThread {
                 .run()
         }))?;
         let ledger = Ledger::default();
-        Ok((core, CoreEnd { requests, parker, reader, progress, wake, ledger, may_poll }))
+        Ok((core, CoreEnd { requests, parker, reader, progress, wake, ledger, asked_at: None, may_poll }))
     }
 }

@@ -3,6 +3,7 @@
 //!
 //! It answers `identify`, `get_clock` and `get_uptime` itself when they come alone in a block: they need no core.
 //! So the host's clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
+//! It also answers `get_config` from the core's last word about it, if the core has nothing to do before it.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +14,7 @@ use std::time::Duration;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
-use pinion_firmware::mcu::base::{ClockResponse, IdentifyResponse, Uptime, identify_response};
+use pinion_firmware::mcu::base::{ClockResponse, Config, IdentifyResponse, Uptime, identify_response};
 use pinion_firmware::mcu::{Dialect, Response};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, TimeSource};
@@ -42,6 +43,16 @@ struct Known {
     get_clock: Option<u32>,
     get_uptime: Option<u32>,
     identify: Option<u32>,
+    get_config: Option<u32>,
+}
+
+/// A block that the link may answer itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Question {
+    Clock,
+    Uptime,
+    Identify { offset: u32, count: u8 },
+    Config,
 }
 
 impl Known {
@@ -50,29 +61,40 @@ impl Known {
             get_clock: dialect.command_id("get_clock"),
             get_uptime: dialect.command_id("get_uptime"),
             identify: dialect.command_id("identify offset=%u count=%c"),
+            get_config: dialect.command_id("get_config"),
             dialect,
         }
     }
 
-    /// The answer to a block that holds only one of these commands.
-    fn answer(&self, payload: &[u8], now: Clock) -> Option<Writer> {
+    /// The question in a block that holds only one of these commands.
+    fn question(&self, payload: &[u8]) -> Option<Question> {
         let mut reader = Reader::new(payload);
         let id = Some(reader.int().ok()?);
-        if id == self.get_clock && reader.is_empty() {
-            return self.encode(&ClockResponse::from(now));
-        }
-        if id == self.get_uptime && reader.is_empty() {
-            return self.encode(&Uptime::from(now));
-        }
-        if id != self.identify {
+        let question = if id == self.get_clock {
+            Question::Clock
+        } else if id == self.get_uptime {
+            Question::Uptime
+        } else if id == self.identify {
+            Question::Identify { offset: reader.int().ok()?, count: reader.int().ok()? as u8 }
+        } else if id == self.get_config {
+            Question::Config
+        } else {
             return None;
+        };
+        reader.is_empty().then_some(question)
+    }
+
+    /// The answer. `config`: the answer to `get_config`, unless the core has to give it.
+    fn answer(&self, question: Question, now: Clock, config: impl FnOnce() -> Option<Config>) -> Option<Writer> {
+        match question {
+            Question::Clock => self.encode(&ClockResponse::from(now)),
+            Question::Uptime => self.encode(&Uptime::from(now)),
+            Question::Identify { offset, count } => {
+                let piece: IdentifyResponse<'_> = identify_response(self.dialect.compressed(), offset, count);
+                self.encode(&piece)
+            }
+            Question::Config => self.encode(&config()?),
         }
-        let (offset, count) = (reader.int().ok()?, reader.int().ok()?);
-        if !reader.is_empty() {
-            return None;
-        }
-        let piece: IdentifyResponse<'_> = identify_response(self.dialect.compressed(), offset, count as u8);
-        self.encode(&piece)
     }
 
     fn encode<R: Response>(&self, response: &R) -> Option<Writer> {
@@ -364,12 +386,14 @@ impl LinkThread {
     /// Answers a block here, if that is possible. A host that does not read gets its answers from the core, like all
     /// others. The core drops answers that find no room.
     fn answer(&mut self, payload: &Payload, now: Clock) -> bool {
-        let Some(answer) = self.known.answer(payload.as_slice(), now) else { return false };
+        let Some(question) = self.known.question(payload.as_slice()) else { return false };
         let core_done = self.core.progress.done();
         self.frame_responses();
         if self.host.is_full() {
             return false;
         }
+        let config = || self.core.config(core_done);
+        let Some(answer) = self.known.answer(question, now, config) else { return false };
         let Some(number) = self.core.ledger.answer(core_done) else { return false };
         if let Some(answer) = answer.payload() {
             self.host.frame(answer, number);
@@ -441,7 +465,8 @@ mod tests {
                 block.int(dialect.command_id(format).unwrap());
                 parameters.iter().for_each(|parameter| block.int(*parameter));
             }
-            let answer = known.answer(block.payload().unwrap(), Clock::from_ticks(7 << 32 | 1234))?;
+            let question = known.question(block.payload().unwrap())?;
+            let answer = known.answer(question, Clock::from_ticks(7 << 32 | 1234), || None)?;
             Some(answer.payload().unwrap().to_vec())
         };
         let get_clock: (&str, &[u32]) = ("get_clock", &[]);
