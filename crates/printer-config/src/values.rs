@@ -40,7 +40,7 @@ impl Section {
 
     /// An option.
     pub fn setting(&self, key: &str) -> Option<&Setting> {
-        self.settings.iter().find(|setting| setting.key == key)
+        self.by_key.get(key).map(|place| &self.settings[*place])
     }
 
     /// The place of an option, or of the section.
