@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tells the program which state of the sources it is built from, and with which compiler. `pinion --version`, the
+//! Gives the program the state of its sources and the name of its compiler. `pinion --version`, the
 //! status and the data dictionary say it.
 
 use std::env;

@@ -118,7 +118,7 @@ pub(super) fn wire(link: &LinkName) -> Finding {
             if let Err(trouble) = uart::find_line(port) {
                 Finding::of("link", Level::Error, trouble)
             } else if access(port.as_path(), AccessFlags::R_OK | AccessFlags::W_OK).is_err() {
-                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev tells it)";
+                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev shows it)";
                 Finding::error("link", format!("{path} may not be opened by this user"), remedy)
             } else {
                 Finding::ok("link", format!("{link}: {path} is there"))
@@ -276,14 +276,14 @@ mod tests {
         fs::write(&path, "").unwrap();
         let refused = link(&path);
         assert_eq!(refused.status, Level::Error);
-        assert_eq!(refused.told.remedy.as_deref(), Some(&*format!("sudo rm {}", path.display())));
+        assert_eq!(refused.trouble.remedy.as_deref(), Some(&*format!("sudo rm {}", path.display())));
         let refused = link(folder.path());
         assert!(
-            refused.told.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")),
+            refused.trouble.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")),
             "{refused:?}"
         );
         let refused = link(&folder.path().join("none/tty"));
-        assert!(refused.status == Level::Error && refused.told.cause.contains("there is no folder"), "{refused:?}");
+        assert!(refused.status == Level::Error && refused.trouble.cause.contains("there is no folder"), "{refused:?}");
     }
 
     #[test]

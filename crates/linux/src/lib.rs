@@ -177,7 +177,7 @@ impl Seen {
     }
 
     /// Everything that a host learns from it, and the numbers that stand for the header.
-    fn told(&self) -> (String, [Vec<Range>; 3], &[u32]) {
+    fn parts(&self) -> (String, [Vec<Range>; 3], &[u32]) {
         let Seen { inventory, names } = self;
         let ranges = [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)];
         (inventory.describe(), ranges, &inventory.vacant)
@@ -206,7 +206,7 @@ impl Seen {
 /// This computer as a board.
 pub struct LinuxBoard {
     /// Shared with the thread that searches again. The core locks it only during configuration. The lock is always held
-    /// only for a moment: no search runs meanwhile.
+    /// only for a moment, never during a search.
     seen: Arc<Mutex<Seen>>,
     guard: SharedGuard,
     fast: FastChips,
@@ -311,7 +311,7 @@ impl Board for LinuxBoard {
     fn look_again(&mut self) -> bool {
         let now = Seen::look();
         let mut seen = self.seen();
-        if now.told() == seen.told() {
+        if now.parts() == seen.parts() {
             return false;
         }
         let before = std::mem::replace(&mut *seen, now);
@@ -381,7 +381,7 @@ impl Board for LinuxBoard {
         })?;
         drop(seen);
         if reader.format().is_none() && self.assumed.insert(device) {
-            log::info!("iio:device{device} does not tell its resolution: 12 bits are assumed");
+            log::info!("iio:device{device} does not report its resolution: 12 bits are assumed");
         }
         Ok(OnWorker { bus: format!("iio:device{device}"), device: Box::new(reader) })
     }

@@ -3,7 +3,7 @@
 //!
 //! It finds out the board, draws the wires, enables the bus, asks the chip, writes the sections of printer.cfg, has klippy
 //! restart, and measures. A call that ends at a reboot or at a wrong wire goes on when it is repeated: each step first
-//! looks whether it is done.
+//! checks if it is done.
 
 #![forbid(unsafe_code)]
 
@@ -35,7 +35,7 @@ mod picture;
 mod printer;
 mod probe;
 
-use catalog::{Board, Boot, Catalog, Check, Device, Kind, Spot, Way, Wire};
+use catalog::{Boot, Catalog, Check, Device, Kind, KnownBoard, Spot, Way, Wire};
 use change::{Change, Record, Side, Splice, copy_of};
 use moonraker::{Host, Moonraker};
 use printer::Printer;
@@ -171,7 +171,7 @@ fn unknown_board(model: &str) -> String {
 }
 
 /// The way to connect a device: the one that is named, or the first one that the board has.
-fn chosen<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result<&'a Way, String> {
+fn chosen<'a>(board: &KnownBoard, device: &'a Device, wanted: Option<&str>) -> Result<&'a Way, String> {
     let mut ways = device.way.iter().filter(|way| match wanted.map(str::to_ascii_lowercase).as_deref() {
         None => true,
         Some("spi") => way.bus == Kind::Spi,
@@ -192,7 +192,7 @@ fn chosen<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result
 }
 
 /// Lists the devices.
-fn list(catalog: &Catalog, board: Option<&Board>, model: &str, report: &mut Report) -> Result<(), String> {
+fn list(catalog: &Catalog, board: Option<&KnownBoard>, model: &str, report: &mut Report) -> Result<(), String> {
     let fits = |device: &Device| board.is_some_and(|board| device.way.iter().any(|way| board.has(way)));
     let buses = |device: &Device| {
         let names: Vec<&str> = device.way.iter().map(|way| way.bus.name()).collect();
@@ -356,7 +356,7 @@ struct Work<'a> {
     args: &'a AddArgs,
     computer: &'a Computer,
     catalog: &'a Catalog,
-    board: &'a Board,
+    board: &'a KnownBoard,
     device: &'a Device,
     way: &'a Way,
     /// The place on the bus.
@@ -563,7 +563,7 @@ impl Work<'_> {
         checks.extend(strays(self.computer, self.board, &self.spot));
         let asked = match (&self.way.check, self.way.driver.is_some()) {
             (Some(Check::W1), _) => match self.thermometer(printer) {
-                Some(serial) => Ok(probe::Answer { told: format!("the thermometer {serial} answers"), address: None }),
+                Some(serial) => Ok(probe::Answer { text: format!("the thermometer {serial} answers"), address: None }),
                 None => {
                     Err("no DS18B20 answers: check its wires and the resistor of 4.7 kOhm from data to 3.3 V".into())
                 }
@@ -573,10 +573,10 @@ impl Work<'_> {
                 Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &mut live)),
                 None => Err(format!("{node} is no bus")),
             },
-            _ => Ok(probe::Answer { told: "it cannot be asked: try it out".into(), address: None }),
+            _ => Ok(probe::Answer { text: "it cannot be asked: try it out".into(), address: None }),
         };
         checks.push(match &asked {
-            Ok(answer) => format!("{}: {}", self.device.name, answer.told),
+            Ok(answer) => format!("{}: {}", self.device.name, answer.text),
             Err(why) => format!("{}: {why}", self.device.name),
         });
         self.report.set("checks", json!(checks));
@@ -598,7 +598,7 @@ impl Work<'_> {
             _ if value >= highest => {
                 Err(format!("{file} is {value}, the highest value: no ground, or nothing is connected at the input"))
             }
-            _ => Ok(probe::Answer { told: format!("{file} is {value} of {highest}"), address: None }),
+            _ => Ok(probe::Answer { text: format!("{file} is {value} of {highest}"), address: None }),
         }
     }
 
@@ -783,9 +783,9 @@ impl Work<'_> {
         }
         if let Some(strip) = section.strip_prefix("neopixel ") {
             moonraker.run(&format!("SET_LED LED={strip} RED=0.5 GREEN=0 BLUE=0"))?;
-            let told = "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
+            let line = "the strip should be red now. If it is green, write color_order: RGB into its section. If it is \
                         dark, check its 5 V, its ground, and that the wire goes to DIN";
-            return Ok(told.into());
+            return Ok(line.into());
         }
         if section.starts_with("temperature_sensor ") {
             let degrees = temperature(moonraker, section)?;
@@ -804,7 +804,7 @@ impl Work<'_> {
 }
 
 /// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
-fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
+fn strays(computer: &Computer, board: &KnownBoard, spot: &Spot) -> Vec<String> {
     let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
     let is_header = |path: &&PathBuf| {
         let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
@@ -873,10 +873,10 @@ fn acceleration(line: &str) -> Option<Result<String, String>> {
     let values: Vec<f64> = values.split(',').filter_map(|value| value.trim().parse().ok()).collect();
     let [x, y, z] = values[..] else { return None };
     let total = (x * x + y * y + z * z).sqrt();
-    let told = format!("it measures {x:.0}, {y:.0}, {z:.0} mm/s2: {:.2} of gravity", total / GRAVITY_MM_S2);
+    let found = format!("it measures {x:.0}, {y:.0}, {z:.0} mm/s2: {:.2} of gravity", total / GRAVITY_MM_S2);
     Some(match (0.7..=1.3).contains(&(total / GRAVITY_MM_S2)) {
-        true => Ok(told),
-        false => Err(format!("{told}: at rest it should be 1: check its wires, its power, and that nothing moves")),
+        true => Ok(found),
+        false => Err(format!("{found}: at rest it should be 1: check its wires, its power, and that nothing moves")),
     })
 }
 
@@ -914,8 +914,8 @@ mod tests {
         let remedies: Vec<(String, String)> = found
             .iter()
             .map(|finding| {
-                let found = finding.told.found();
-                (found.split(']').next().unwrap().to_owned(), finding.told.remedy.clone().unwrap_or_default().into())
+                let found = finding.trouble.found();
+                (found.split(']').next().unwrap().to_owned(), finding.trouble.remedy.clone().unwrap_or_default().into())
             })
             .collect();
         let expected = [

@@ -60,7 +60,7 @@ impl FromStr for FastGpio {
 }
 
 const DEV_MEM: &str = "/dev/mem";
-/// Highest number of comparisons of a level with the kernel's. A level may change between two looks.
+/// Highest number of comparisons of a level with the kernel's. A level may change between two reads.
 const LOOKS_MAX: u32 = 100;
 
 /// The arrangement of a chip's registers.

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How long a thread polls for the next step of a conversation before it sleeps.
+//! How long a thread polls for the next job, or for its result, before it sleeps.
 //!
 //! A wake-up takes 20 to 50 us on the computers measured. Most answers of a bus take less. So the core polls for an
 //! answer, and a worker polls for the next question. With a single processor nothing polls, because the other thread
-//! needs that processor. Polling is rationed. So an endless conversation takes no processor from the host. Nor does it
-//! use up the time that the kernel allows real-time threads.
+//! needs that processor. Polling is rationed. So an endless series of jobs takes no processor from the host. Nor does
+//! it use up the time that the kernel allows real-time threads.
 
 #![forbid(unsafe_code)]
 
@@ -32,7 +32,7 @@ impl PollBudget {
         PollBudget { may_poll, until: now, looked: now, ration: RATION }
     }
 
-    /// The next step of the conversation is expected within `span`.
+    /// The next job, or its result, is expected within `span`.
     #[inline]
     pub(crate) fn expect(&mut self, now: Clock, span: Ticks) {
         if self.may_poll {
@@ -42,7 +42,7 @@ impl PollBudget {
         }
     }
 
-    /// Whether to look once more before sleeping.
+    /// Whether to poll once more before sleeping.
     #[inline]
     pub(crate) fn goes_on(&mut self, now: Clock) -> bool {
         if now >= self.until {
@@ -92,7 +92,7 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// In any second, any conversation polls for at most a quarter of the time and one ration.
+        /// In any second, any series of jobs polls for at most a quarter of the time and one ration.
         #[test]
         fn polling_is_rationed(turns in proptest::collection::vec((0u64..20_000, 1u64..20_000), 1..20)) {
             let mut polling = PollBudget::new(true, Clock::from_ticks(0));

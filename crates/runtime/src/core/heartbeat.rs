@@ -2,7 +2,7 @@
 //! The heartbeats, in a page of memory that the program and the guardian share. The page has the core's heartbeat and
 //! the guardian's. It also has the pending shutdown values, and each worker's present job.
 //!
-//! A beat is the instant at which it was given. So a listener knows when silence began, and need not look more often
+//! A beat is the instant at which it was given. So a listener knows when silence began, and need not check more often
 //! than silence may last. The core sets that limit with each beat. It is about half a second while the MCU runs
 //! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Otherwise the outputs are at their start or shutdown values.
 //! Opening a device or ending a worker may then take its time.
@@ -27,7 +27,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys::{self, SHARED_WORDS};
-use pinion_sync::heartbeat::{JobSlot, LastBeat, SharedHeartbeat};
+use pinion_sync::heartbeat::{LastBeat, SharedHeartbeat, WorkerSlot};
 
 /// How long the core may be silent while the MCU runs.
 pub(crate) const RUNNING: Duration = Duration::from_millis(550);
@@ -54,7 +54,7 @@ const LISTENED_AT: usize = 0;
 const UNANSWERED: usize = 1;
 /// How long the computer was suspended. The core clears it when it has seen it.
 const SUSPENDED_MS: usize = 2;
-/// The first word of the core's heartbeat. It owes shutdown values.
+/// The first word of the core's heartbeat. It has pending shutdown values.
 const HEART: usize = 5;
 /// The first word of the workers.
 const WORKERS: usize = 24;
@@ -115,12 +115,12 @@ impl Heartbeat {
         Some(Shutdown::because(reason::TIMER_PAST, trouble))
     }
 
-    fn tell_suspension(&self, suspended: Duration) {
+    fn publish_suspension(&self, suspended: Duration) {
         self.page[SUSPENDED_MS].store(suspended.as_millis() as u32, Ordering::Relaxed);
     }
 
-    /// From now on the MCU owes the shutdown value of `subject`, such as `pwmchip0/pwm1`. The first call is a sign of
-    /// life at `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
+    /// From now on the shutdown value of `subject`, such as `pwmchip0/pwm1`, is pending. The first call is a beat at
+    /// `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
     /// replaces the subject, not the time. Only the core calls this.
     pub(crate) fn set_pending(&self, subject: &str, now: Clock) {
         self.heart().set_pending(subject, stamp(now));
@@ -163,7 +163,7 @@ impl Heartbeat {
     pub(crate) fn diagnosis(&self) -> String {
         let (silence_max, ms) = (self.heart().listen().silence_max_ms, self.listen().0.as_millis());
         match silence_max {
-            Some(_) => format!("the core gave no sign of life for {ms} ms"),
+            Some(_) => format!("the core had no heartbeat for {ms} ms"),
             None => format!(
                 "{} is not at its shutdown value within {ms} ms: check its power and wiring, and look at the kernel's log (dmesg)",
                 self.heart().subject().get()
@@ -180,12 +180,12 @@ impl Heartbeat {
 
     /// The bus of a worker whose present job takes longer than `limit` at `now`.
     pub(crate) fn stuck(&self, now: Clock, limit: Duration) -> Option<String> {
-        let is_stuck = |slot: &JobSlot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
+        let is_stuck = |slot: &WorkerSlot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
         self.slots().find(is_stuck).map(|slot| slot.name().get())
     }
 
-    fn slots(&self) -> impl Iterator<Item = JobSlot<'static>> {
-        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(JobSlot::new)
+    fn slots(&self) -> impl Iterator<Item = WorkerSlot<'static>> {
+        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(WorkerSlot::new)
     }
 }
 
@@ -193,7 +193,7 @@ fn stamp(now: Clock) -> u32 {
     (now.ticks() >> STAMP_SHIFT) as u32
 }
 
-/// The time from a stamp until `now`. Zero if the stamp was set meanwhile and is later than `now`.
+/// The time from a stamp until `now`. Zero if the stamp was set after `now` was read.
 fn elapsed(since: u32, now: Clock) -> Duration {
     let stamps = (stamp(now).wrapping_sub(since) as i32).max(0);
     Duration::from_nanos(((stamps as u64) << STAMP_SHIFT) * NS_PER_TICK)
@@ -201,7 +201,7 @@ fn elapsed(since: u32, now: Clock) -> Duration {
 
 /// Shows others since when a worker is at its present job.
 pub(crate) struct JobClock {
-    slot: JobSlot<'static>,
+    slot: WorkerSlot<'static>,
     heartbeat: Heartbeat,
 }
 
@@ -243,7 +243,7 @@ impl Silence {
         Silence { heard: sign, length: Duration::ZERO, looked: now, pause: Duration::ZERO }
     }
 
-    /// Takes in that the sign is `sign` at `now`. Returns how long not to look again, at most `longest`. `None` if the
+    /// Takes in that the sign is `sign` at `now`. Returns the time until the next check, at most `longest`. `None` if the
     /// sign has been missing for `silence_max`.
     fn listen(&mut self, sign: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
         let slept = Duration::from_nanos(now.since(self.looked).max(0) as u64 * NS_PER_TICK);
@@ -271,11 +271,11 @@ impl HeartbeatMonitor {
         HeartbeatMonitor { heartbeat, silence: Silence::new(beat_at, now), suspensions: Suspensions::new() }
     }
 
-    /// How long not to look again. `None` if the heartbeat is missing at `now`.
+    /// The time until the next check. `None` if the heartbeat is missing at `now`.
     pub(crate) fn listen(&mut self, now: Clock) -> Option<Duration> {
         self.heartbeat.page[LISTENED_AT].store(stamp(now).max(1), Ordering::Relaxed);
         if let Some(suspended) = self.suspensions.newest() {
-            self.heartbeat.tell_suspension(suspended);
+            self.heartbeat.publish_suspension(suspended);
         }
         let (silence_max, beat_at) = self.heartbeat.listen();
         // No longer than the limit of a running MCU: by then the core may have begun to run.
@@ -337,7 +337,7 @@ impl GuardianMonitor {
         GuardianMonitor { heartbeat, silence: None, due: Duration::ZERO }
     }
 
-    /// When to look next (CLOCK_MONOTONIC). `None` while the guardian holds nothing.
+    /// The time of the next check (CLOCK_MONOTONIC). `None` while the guardian holds nothing.
     pub(crate) fn due(&self) -> Option<Duration> {
         let is_set = |word: usize| self.heartbeat.page[word].load(Ordering::Relaxed) != 0;
         if is_set(UNANSWERED) {
@@ -448,7 +448,7 @@ mod tests {
         let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         let (after, _) = silent_after(&mut monitor, 0);
         assert!((29_990..30_010).contains(&after), "{after} ms");
-        assert_eq!(heartbeat.diagnosis(), "the core gave no sign of life for 30000 ms");
+        assert_eq!(heartbeat.diagnosis(), "the core had no heartbeat for 30000 ms");
     }
 
     #[test]
@@ -527,7 +527,7 @@ mod tests {
         heartbeat.beat(at(0), true);
         monitor.listen(at(0)).unwrap();
         assert!(heartbeat.standstill(at(1)).is_none(), "this computer was not suspended meanwhile");
-        heartbeat.tell_suspension(Duration::from_secs(60));
+        heartbeat.publish_suspension(Duration::from_secs(60));
         let shutdown = heartbeat.standstill(at(3)).unwrap();
         assert!(shutdown.trouble.cause.contains("suspended for 60000 ms"), "{shutdown}");
         assert!(heartbeat.standstill(at(4)).is_none());

@@ -245,8 +245,8 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
-    /// A core that continues to run, but owes a shutdown value forever.
-    fn stop_and_owe(heartbeat: Heartbeat) {
+    /// A core that continues to run, with a shutdown value that is pending forever.
+    fn stop_with_pending(heartbeat: Heartbeat) {
         for beats in 0.. {
             if beats == 10 {
                 heartbeat.set_pending("pwmchip7/pwm0", heartbeat.now());
@@ -355,7 +355,7 @@ mod tests {
         match script.as_str() {
             "abort" => std::process::abort(),
             "goodbye" => guardian.goodbye(),
-            "owe" => stop_and_owe(heartbeat),
+            "pending" => stop_with_pending(heartbeat),
             _ => loop {
                 thread::sleep(Duration::from_secs(1));
             },
@@ -417,7 +417,7 @@ mod tests {
 
     #[test]
     fn an_output_that_does_not_get_its_shutdown_value_is_named_and_the_program_killed() {
-        let mut guarded = Guarded::start("owe");
+        let mut guarded = Guarded::start("pending");
         assert_eq!(guarded.signal(), Some(9));
         guarded.wait_for_the_guardian();
         assert_eq!(guarded.output(), "off");

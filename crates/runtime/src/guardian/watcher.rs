@@ -397,8 +397,8 @@ type Attempt = (usize, io::Result<()>);
 
 /// Threads that each drive a group of outputs. So a driver that hangs delays neither the other groups nor this process.
 struct RescueThreads {
-    tell: Sender<Attempt>,
-    told: Receiver<Attempt>,
+    outcome_to: Sender<Attempt>,
+    outcomes_from: Receiver<Attempt>,
     /// Indexed by the outputs' numbers.
     outcomes: Vec<Outcome>,
     /// Work without a thread: none could be started because memory is short.
@@ -407,8 +407,8 @@ struct RescueThreads {
 
 impl Default for RescueThreads {
     fn default() -> RescueThreads {
-        let (tell, told) = mpsc::channel();
-        RescueThreads { tell, told, outcomes: Vec::new(), left: Vec::new() }
+        let (outcome_to, outcomes_from) = mpsc::channel();
+        RescueThreads { outcome_to, outcomes_from, outcomes: Vec::new(), left: Vec::new() }
     }
 }
 
@@ -424,11 +424,11 @@ impl RescueThreads {
         // If the thread cannot be started, its closure is dropped with all that it owns. So it shares the work with
         // this function, which can then take the work back.
         let work = Arc::new(Mutex::new(Some(Work { drives, survivor, try_for })));
-        let (theirs, tell) = (work.clone(), self.tell.clone());
+        let (theirs, outcome_to) = (work.clone(), self.outcome_to.clone());
         let run = move || {
             if let Some(work) = take(&theirs) {
                 // Sending fails once `wait` has returned. Nobody needs the result then.
-                work.run(|report| drop(tell.send(report)));
+                work.run(|report| drop(outcome_to.send(report)));
             }
         };
         if thread::Builder::new().spawn(run).is_err() {
@@ -439,9 +439,9 @@ impl RescueThreads {
     /// Waits until all outputs are driven, or `limit` is over, and returns the outcomes. It calls `complain` once for
     /// each output whose first attempt fails.
     fn wait(self, limit: Duration, mut complain: impl FnMut(&Outcome)) -> Vec<Outcome> {
-        let RescueThreads { tell, told, mut outcomes, left } = self;
+        let RescueThreads { outcome_to, outcomes_from, mut outcomes, left } = self;
         // Without this sender the channel closes when the last thread is done, and ends the wait.
-        drop(tell);
+        drop(outcome_to);
         let mut note = |(number, result): Attempt| {
             let outcome: &mut Outcome = &mut outcomes[number];
             let first = outcome.result.is_none();
@@ -451,7 +451,7 @@ impl RescueThreads {
             }
         };
         let until = monotonic() + limit;
-        while let Ok(report) = told.recv_timeout(until.saturating_sub(monotonic())) {
+        while let Ok(report) = outcomes_from.recv_timeout(until.saturating_sub(monotonic())) {
             note(report);
         }
         // This comes last, because a driver that hangs would block this thread.

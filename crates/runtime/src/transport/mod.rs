@@ -68,7 +68,7 @@ pub(crate) trait Link {
     /// # Errors
     ///
     /// The link does not work any more.
-    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard>;
+    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Input>;
 
     /// Writes as many bytes as there is room for. Returns how many.
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize>;
@@ -100,7 +100,7 @@ pub(crate) fn serving(is_open: bool) -> &'static str {
 
 /// The result of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Heard {
+pub(crate) enum Input {
     /// This many bytes came, or none.
     Bytes(usize),
     /// The host is gone.
