@@ -25,9 +25,8 @@ use super::ssh::{Ssh, Target};
 use super::{Flow, Incoming, SYNC};
 use crate::process::notify::Notify;
 use crate::process::signals::{Signal, Signals};
-use crate::transport::Incoming as FromHost;
-use crate::transport::Link;
 use crate::transport::pty::{Access, Pty};
+use crate::transport::{Input, Link};
 use crate::trouble::{no_room, refused};
 
 /// The pauses between attempts to connect. Each is twice the one before.
@@ -233,8 +232,8 @@ impl Near {
                     .outward
                     .fill(|buffer| {
                         Ok(match pty.read(buffer, false)? {
-                            FromHost::Bytes(bytes) => Incoming::Bytes(bytes),
-                            FromHost::Gone | FromHost::Over => Incoming::Over,
+                            Input::Bytes(bytes) => Incoming::Bytes(bytes),
+                            Input::Gone | Input::Over => Incoming::Over,
                         })
                     })
                     .map_err(about)?;
@@ -247,7 +246,7 @@ impl Near {
             None if !self.is_attached => {
                 warn!("{} is not connected: what was written to {} is lost", self.target.host, self.link.display());
                 let mut lost = [0; 4096];
-                while pty.read(&mut lost, false).map_err(about)? != FromHost::Bytes(0) {}
+                while pty.read(&mut lost, false).map_err(about)? != Input::Bytes(0) {}
             }
             None => {}
         }

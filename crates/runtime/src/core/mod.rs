@@ -6,6 +6,7 @@
 pub(crate) mod budget;
 pub(crate) mod busy_poll;
 pub(crate) mod heartbeat;
+pub(crate) mod monitors;
 pub(crate) mod responses;
 pub(crate) mod start;
 pub mod wakeup;

@@ -28,6 +28,9 @@
 #![forbid(unsafe_code)]
 
 mod message;
+mod outputs;
+mod program;
+mod rescue;
 mod watcher;
 
 use std::io::{self, IoSlice};
@@ -50,13 +53,15 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{monotonic, wait_until};
 use pinion_linux::sys;
 
-use crate::core::heartbeat::{GuardianMonitor, Heartbeat};
+use crate::core::heartbeat::Heartbeat;
+use crate::core::monitors::GuardianMonitor;
 use crate::process::forked::THREADS_MAX;
 use crate::recorder::Recording;
 use crate::trouble::{NO_PROCESS, refused};
 
 use message::{Message, TAKEN};
-use watcher::{END_LIMIT, Program, Watcher};
+use program::{END_LIMIT, Program};
+use watcher::Watcher;
 
 pub(crate) use watcher::NAME;
 #[cfg(fuzzing)]
