@@ -8,7 +8,7 @@ use std::process::Command;
 /// The sources of the program.
 const SOURCES: [&str; 4] = ["../../src", "../../crates", "../../Cargo.toml", "../../Cargo.lock"];
 
-/// Where the sources are not a checkout of git, as when a package is built, whoever gives them may say
+/// Where the sources are not a checkout of git, as when a package is built, the builder may say
 /// which state they are of.
 const GIVEN: &str = "PINION_GIT_STATE";
 

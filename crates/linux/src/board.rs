@@ -17,12 +17,11 @@ use pinion_firmware::trouble::Trouble;
 
 use crate::gpio::{FastChips, FastGpio};
 use crate::guard::{Guard, SharedGuard};
-use crate::inventory::{DEV, GPIO, IIO, Inventory, PWM};
+use crate::inventory::Inventory;
 use crate::pins::{Names, Target};
+use crate::places::{DEV, GPIO, IIO, PWM, SPI_MASTERS, W1};
 use crate::{adc, gpio, i2c, pins, pwm, spi, uart, w1};
 
-const SPI_MASTERS: &str = "/sys/class/spi_master";
-const W1: &str = "/sys/bus/w1/devices";
 /// The worker that reads the edges of all lines.
 const EDGE_WORKER: &str = "edges";
 

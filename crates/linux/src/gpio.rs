@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use gpio_cdev::{LineHandle, LineRequestFlags};
 
 use super::guard::SharedGuard;
-use crate::inventory::GPIO;
+use crate::places::GPIO;
 use crate::sys;
 use pinion_firmware::board::{Bank, Bias, Direction, Line};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};

@@ -9,15 +9,8 @@ use industrial_io::Context;
 
 use pinion_firmware::trouble::Trouble;
 
+use crate::places::{DEV, GPIO, IIO, PWM, TTY};
 use crate::{adc, gpio, i2c, pwm, spi, uart};
-
-pub(crate) const DEV: &str = "/dev";
-pub(crate) const GPIO: &str = "/sys/bus/gpio/devices";
-/// The kernel's policy for the sleep of PCIe links.
-pub(crate) const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
-pub(crate) const PWM: &str = "/sys/class/pwm";
-pub(crate) const IIO: &str = "/sys/bus/iio/devices";
-pub(crate) const TTY: &str = "/sys/class/tty";
 
 /// The devices of this computer.
 #[derive(Debug, Default)]

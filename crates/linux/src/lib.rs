@@ -16,6 +16,7 @@ mod inventory;
 pub mod own_folder;
 pub mod parker;
 pub mod pins;
+mod places;
 pub mod proc;
 pub mod pwm;
 pub mod spi;

@@ -121,7 +121,7 @@ pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
             return Err(no_port(Errno::ENOTTY));
         }
         let name = target.file_name().unwrap_or_default().to_string_lossy();
-        let consoles = sysfs::text(&Path::new(crate::inventory::TTY).join("console/active")).unwrap_or_default();
+        let consoles = sysfs::text(&Path::new(crate::places::TTY).join("console/active")).unwrap_or_default();
         if consoles.split_whitespace().any(|console| console == name) {
             return Err(console());
         }

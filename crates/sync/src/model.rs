@@ -173,7 +173,7 @@ fn a_beat_is_as_new_as_its_limit() {
 }
 
 #[test]
-fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
+fn a_pending_value_has_its_subject_and_begins_and_ends_with_a_beat() {
     let start = || {
         let words = words::<5>();
         SharedHeartbeat::new(&words).beat(1, RUNNING);

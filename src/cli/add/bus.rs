@@ -57,7 +57,7 @@ impl Work<'_> {
         let file = self.computer.first(&self.board.files.iter().map(String::as_str).collect::<Vec<_>>());
         let side = system(self.computer);
         let mut wanted: Vec<&str> = Vec::new();
-        // A bus that is there stays as it is, whoever has enabled it.
+        // A bus that is there stays as it is: the user may have enabled it.
         // But LEDs also need a clock that stays.
         if self.way.driver.is_none() && (!is_there || self.way.bus == Kind::Leds) {
             wanted.extend(bus.enable.iter().map(String::as_str));

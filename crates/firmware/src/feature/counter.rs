@@ -150,7 +150,7 @@ impl Job for Reading {
 /// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
-        "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
+        "counter ({name}): {per_s} edges a second are not from a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
     )
 }
 

@@ -26,7 +26,7 @@ use super::{Flow, Incoming, SYNC};
 use crate::process::notify::Notify;
 use crate::process::signals::{Signal, Signals};
 use crate::transport::pty::{Access, Pty};
-use crate::transport::{Input, Link};
+use crate::transport::{Input, Transport};
 use crate::trouble::{no_room, refused};
 
 /// The pauses between attempts to connect. Each is twice the one before.

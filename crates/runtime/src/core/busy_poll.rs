@@ -21,7 +21,7 @@ const EARNS: i64 = 3;
 pub(crate) struct PollBudget {
     may_poll: bool,
     until: Clock,
-    looked: Clock,
+    polled_at: Clock,
     /// Ticks left for polling.
     ration: i64,
 }
@@ -29,15 +29,15 @@ pub(crate) struct PollBudget {
 impl PollBudget {
     /// Nothing is expected yet. Without `may_poll` the thread never polls.
     pub(crate) fn new(may_poll: bool, now: Clock) -> PollBudget {
-        PollBudget { may_poll, until: now, looked: now, ration: RATION }
+        PollBudget { may_poll, until: now, polled_at: now, ration: RATION }
     }
 
     /// The next job, or its result, is expected within `span`.
     #[inline]
     pub(crate) fn expect(&mut self, now: Clock, span: Ticks) {
         if self.may_poll {
-            self.ration = (self.ration + now.since(self.looked).max(0) / EARNS).min(RATION);
-            self.looked = now;
+            self.ration = (self.ration + now.since(self.polled_at).max(0) / EARNS).min(RATION);
+            self.polled_at = now;
             self.until = now + span;
         }
     }
@@ -48,8 +48,8 @@ impl PollBudget {
         if now >= self.until {
             return false;
         }
-        self.ration -= now.since(self.looked).max(0);
-        self.looked = now;
+        self.ration -= now.since(self.polled_at).max(0);
+        self.polled_at = now;
         if self.ration <= 0 {
             self.until = now;
         }

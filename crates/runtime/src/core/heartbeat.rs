@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_mcu_that_stood_still_is_told_so_once() {
+    fn a_running_mcu_that_stood_still_is_stopped_once() {
         let heartbeat = heartbeat();
         heartbeat.beat(at(0), true);
         assert!(heartbeat.standstill(at(990)).is_none());

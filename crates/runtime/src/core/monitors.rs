@@ -12,7 +12,7 @@ use pinion_linux::clock::monotonic;
 
 use super::heartbeat::{Heartbeat, RUNNING, elapsed, stamp};
 
-/// How long the guardian may be silent while it holds outputs. It leaves a sign every [`RUNNING`].
+/// How long the guardian may be silent while it holds outputs. It beats every [`RUNNING`].
 const GUARDIAN: Duration = Duration::from_secs(2);
 /// Longest oversleep that counts as listening. After a longer one, only this much of the sleep counts.
 const OVERSLEPT: Duration = Duration::from_millis(100);
@@ -22,34 +22,34 @@ const SUSPENSION_MIN: Duration = Duration::from_millis(1);
 /// How long a heartbeat is missing. Silence counts only while the listener itself was awake. Both processes may
 /// stand still together, as in a frozen control group. Then neither one believes that the other hangs.
 struct Silence {
-    /// The last sign that was heard.
+    /// The last beat that was heard.
     heard: u32,
     length: Duration,
-    looked: Clock,
-    /// How long the listener meant to sleep then.
+    checked_at: Clock,
+    /// How long the listener meant to sleep after its last check.
     pause: Duration,
 }
 
 impl Silence {
-    /// No silence so far. The sign is `sign` at `now`.
-    fn new(sign: u32, now: Clock) -> Silence {
-        Silence { heard: sign, length: Duration::ZERO, looked: now, pause: Duration::ZERO }
+    /// No silence so far. The last beat is `beat` at `now`.
+    fn new(beat: u32, now: Clock) -> Silence {
+        Silence { heard: beat, length: Duration::ZERO, checked_at: now, pause: Duration::ZERO }
     }
 
-    /// Takes in that the sign is `sign` at `now`. Returns the time until the next check, at most `longest`. `None` if the
-    /// sign has been missing for `silence_max`.
-    fn listen(&mut self, sign: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
-        let slept = Duration::from_nanos(now.since(self.looked).max(0) as u64 * NS_PER_TICK);
+    /// Takes in that the last beat is `beat` at `now`. Returns the time until the next check, at most `longest`. `None` if
+    /// no beat has come for `silence_max`.
+    fn listen(&mut self, beat: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
+        let slept = Duration::from_nanos(now.since(self.checked_at).max(0) as u64 * NS_PER_TICK);
         let listened = if slept > self.pause + OVERSLEPT { OVERSLEPT } else { slept };
-        self.length = if sign == self.heard { self.length + listened } else { elapsed(sign, now).min(listened) };
+        self.length = if beat == self.heard { self.length + listened } else { elapsed(beat, now).min(listened) };
         let left = silence_max.checked_sub(self.length).filter(|left| !left.is_zero())?;
         self.pause = left.min(longest);
-        (self.heard, self.looked) = (sign, now);
+        (self.heard, self.checked_at) = (beat, now);
         Some(self.pause)
     }
 }
 
-/// The guardian's monitor. It listens to the heartbeat, and leaves a sign of its own each time. It lives as long as the
+/// The guardian's monitor. It listens to the heartbeat, and beats itself each time. It lives as long as the
 /// guardian holds outputs.
 pub(crate) struct HeartbeatMonitor {
     heartbeat: Heartbeat,
@@ -141,13 +141,13 @@ impl GuardianMonitor {
         if self.heartbeat.is_unanswered() {
             return true;
         }
-        let sign = self.heartbeat.listened_at();
-        if sign == 0 || now < self.due {
+        let beat = self.heartbeat.listened_at();
+        if beat == 0 || now < self.due {
             return false;
         }
         let clock = self.heartbeat.at(now);
-        let silence = self.silence.get_or_insert_with(|| Silence::new(sign, clock));
-        let pause = silence.listen(sign, clock, GUARDIAN, GUARDIAN);
+        let silence = self.silence.get_or_insert_with(|| Silence::new(beat, clock));
+        let pause = silence.listen(beat, clock, GUARDIAN, GUARDIAN);
         self.due = now + pause.unwrap_or_default();
         pause.is_none()
     }
@@ -173,7 +173,7 @@ mod tests {
         heartbeat
     }
 
-    /// After how many milliseconds a punctual listener hears that the heartbeat is missing, and how often it looked.
+    /// After how many milliseconds a punctual listener hears that the heartbeat is missing, and how often it checked_at.
     fn silent_after(monitor: &mut HeartbeatMonitor, from_ms: u64) -> (u64, u32) {
         let (mut ms, mut looks) = (from_ms, 0);
         while let Some(pause) = monitor.listen(at(ms)) {
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shutdown_value_that_is_owed_stops_the_heart() {
+    fn a_pending_shutdown_value_stops_the_heartbeat() {
         let heartbeat = heartbeat();
         let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         heartbeat.beat(at(0), true);
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_core_was_at_before_the_mcu_owed_anything_does_not_count() {
+    fn work_of_the_core_before_a_value_is_pending_does_not_count() {
         let heartbeat = heartbeat();
         let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         // The core fails to open a device, and the MCU stops.
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_mcu_that_was_suspended_is_told_so_once() {
+    fn a_running_mcu_that_was_suspended_is_stopped_once() {
         let heartbeat = heartbeat();
         let mut monitor = HeartbeatMonitor::new(heartbeat, at(0));
         heartbeat.beat(at(0), true);

@@ -23,7 +23,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
-use super::{Input, Link};
+use super::{Input, Transport};
 use crate::transport::place::Place;
 use crate::transport::served::served;
 use crate::transport::terminal_group::{CLOSED, TerminalGroup};
@@ -188,7 +188,7 @@ fn turn(symlink: &Path) -> Option<Flock<File>> {
     }
 }
 
-impl Link for Pty {
+impl Transport for Pty {
     fn place(&self) -> String {
         self.symlink.display().to_string()
     }

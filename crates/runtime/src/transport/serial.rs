@@ -21,7 +21,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 use pinion_linux::uart;
 
-use super::{Input, Link};
+use super::{Input, Transport};
 
 /// How long to wait before a port that is gone is opened again.
 const REOPEN: Duration = Duration::from_secs(1);
@@ -65,7 +65,7 @@ impl SerialLine {
     }
 }
 
-impl Link for SerialLine {
+impl Transport for SerialLine {
     fn place(&self) -> String {
         self.path.display().to_string()
     }

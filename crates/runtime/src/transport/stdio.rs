@@ -20,7 +20,7 @@ use signal_hook::low_level::emulate_default_handler;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
-use super::{Input, Link};
+use super::{Input, Transport};
 use crate::process::signals;
 use crate::trouble::{refused, started};
 
@@ -159,7 +159,7 @@ fn shows_log(fd: impl AsFd + IsTerminal) -> bool {
     fd.is_terminal() && log.is_terminal() && device(fd.as_fd()) == device(log.as_fd())
 }
 
-impl Link for Stdio {
+impl Transport for Stdio {
     fn place(&self) -> String {
         "standard input".into()
     }

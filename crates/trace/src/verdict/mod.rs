@@ -15,7 +15,6 @@ use death::{died, hung};
 use evidence::{MS, Record};
 use host::{host_lost, not_refreshed, too_close};
 use processors::{late_step, of_core};
-use standstill::stood_still;
 
 use super::file::{End, Trace};
 
@@ -96,6 +95,14 @@ pub fn verdict(trace: &Trace) -> Verdict {
         End::Asked => asked(&record),
     };
     Verdict { culprit, text: if remedy.is_empty() { what } else { format!("{what}: {remedy}") } }
+}
+
+/// The core noticed that it gave no beat for a second or more, or that the computer was suspended.
+fn stood_still(record: &Record, trouble: &str) -> Judgment {
+    let gap = record.gap((record.first_of_core().unwrap_or(0).min(0), 0));
+    // The clock of the events stands still while the computer is suspended.
+    let found = if gap.1 - gap.0 > SILENT && gap.1 > -PROMPT { of_core(record, gap) } else { None };
+    found.unwrap_or_else(|| Judgment::new(Culprit::Standstill, format!("everything stood still: {trouble}"), ""))
 }
 
 /// Why the MCU stopped.

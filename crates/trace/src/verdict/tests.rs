@@ -323,7 +323,7 @@ fn a_call_that_takes_long_is_told_from_a_flood_of_work() {
 }
 
 #[test]
-fn a_standstill_is_told_with_what_went_on() {
+fn a_standstill_is_named_with_the_threads_that_went_on() {
     const OURS: [&str; 3] = ["core", "link", "sampler"];
     let past = "Rescheduled timer in the past";
     let stood = |threads: &[&str]| {
@@ -633,8 +633,8 @@ fn a_program_that_is_gone_is_told_with_what_it_did_last() {
         Culprit::Driver,
         "Pinion hung: one call to a driver or the kernel kept the core for 1.0 s: look for its device in dmesg",
     );
-    let owing = Scene::calm().silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST);
-    hung(owing, Culprit::Death, "Pinion hung: the core had no heartbeat for 1000 ms: report it with its log");
+    let pending = Scene::calm().silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST);
+    hung(pending, Culprit::Death, "Pinion hung: the core had no heartbeat for 1000 ms: report it with its log");
 }
 
 #[test]

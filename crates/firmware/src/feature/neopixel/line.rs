@@ -28,7 +28,7 @@ use super::INVALID_SIZE;
 const TO_SPI: &str =
     "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\"";
 const OR_TO_FAST_LINE: &str =
-    ", or to a line that is written through registers (pinion pins lists them; none of a Raspberry Pi 5 will do)";
+    ", or to a line that is written through registers (pinion pins lists them), but not on a Raspberry Pi 5";
 const OR_BY_THE_KERNEL: &str = "; for LEDs without the host there is the kernel's overlay ws2812-pio";
 
 /// All chains on lines share this worker.

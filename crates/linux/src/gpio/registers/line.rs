@@ -110,7 +110,7 @@ impl<R: Register> LineRegisters<R> {
         self.bank.flush();
     }
 
-    /// The line's level, whoever drives it.
+    /// The line's level, also if another device drives it.
     #[inline]
     pub(in crate::gpio) fn read(&self) -> bool {
         self.level.load() & self.mask != 0

@@ -22,7 +22,7 @@ use std::str::FromStr;
 
 use super::HeldLine;
 use super::refusal::{Subject, not_permitted};
-use crate::inventory::ASPM_POLICY;
+use crate::places::ASPM_POLICY;
 use crate::{LOOK_AT_LOG, sys};
 use pinion_firmware::board::Direction;
 use pinion_firmware::trouble::Trouble;

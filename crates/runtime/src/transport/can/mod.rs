@@ -24,7 +24,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::can;
 use pinion_linux::clock::monotonic;
 
-use super::{Input, Link};
+use super::{Input, Transport};
 use crate::trouble::refused;
 
 mod node;
@@ -308,7 +308,7 @@ fn is_full(error: &io::Error) -> bool {
     error.kind() == ErrorKind::WouldBlock || error.raw_os_error() == Some(libc::ENOBUFS)
 }
 
-impl Link for CanBus {
+impl Transport for CanBus {
     fn place(&self) -> String {
         self.interface.clone()
     }
