@@ -271,7 +271,7 @@ mod tests {
         let path = folder.path().join("tty");
         assert_eq!(link(&path).status, Level::Ok);
         std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
-        assert!(link(&path).told.cause.ends_with("is a link, and will be replaced"));
+        assert!(link(&path).trouble.cause.ends_with("is a link, and will be replaced"));
         fs::remove_file(&path).unwrap();
         fs::write(&path, "").unwrap();
         let refused = link(&path);
@@ -290,12 +290,12 @@ mod tests {
     fn a_wire_that_is_not_there_yet_is_a_warning() {
         let told = |link: &str| wire(&link.parse().unwrap());
         let port = told("serial:/dev/none");
-        assert!(port.status == Level::Warning && port.told.cause.contains("there is no /dev/none"), "{port:?}");
+        assert!(port.status == Level::Warning && port.trouble.cause.contains("there is no /dev/none"), "{port:?}");
         let bus = told("can:none,0123456789ab");
         match can_open("none") {
-            Ok(()) => assert!(bus.told.cause.contains("there is no CAN interface none"), "{bus:?}"),
+            Ok(()) => assert!(bus.trouble.cause.contains("there is no CAN interface none"), "{bus:?}"),
             // This kernel has no CAN.
-            Err(trouble) => assert_eq!((bus.status, bus.told), (Level::Error, trouble)),
+            Err(trouble) => assert_eq!((bus.status, bus.trouble), (Level::Error, trouble)),
         }
         assert_eq!(told("stdio").status, Level::Ok);
     }

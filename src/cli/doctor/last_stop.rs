@@ -77,7 +77,7 @@ mod tests {
         };
         let mut newest = Trace { head, threads: Vec::new() };
         let ended = UNIX_EPOCH + Duration::from_millis(newest.head.utc_ms);
-        assert_eq!(finding(ended).told.found(), "no stop of the MCU is recorded");
+        assert_eq!(finding(ended).trouble.found(), "no stop of the MCU is recorded");
         let path = tree.computer().path("/var/lib/pinion/mcu-20261122T142614.000Z.trace");
         let put = |trace: &Trace| {
             let mut file = Vec::new();
@@ -106,6 +106,6 @@ mod tests {
         assert!(found.trouble.found().contains("nobody was late: the host asked for it"), "{found:?}");
         // A newer file, which cannot be read.
         tree.put("var/lib/pinion/mcu-20261123T142614.000Z.trace", "x");
-        assert!(finding(ended).told.found().contains("unknown: "));
+        assert!(finding(ended).trouble.found().contains("unknown: "));
     }
 }

@@ -42,7 +42,7 @@ const FRAC_BITS_MASK: u8 = 0x3f;
 fn fixed_mul(coefficient: i32, value: i32, frac_bits: u8) -> Result<i32, Overflow> {
     let mut product = i64::from(coefficient) * i64::from(value);
     if frac_bits > 0 {
-        // Wraps for -2^31 times -2^31 with 63 fractional bits, as on Klipper's processors.
+        // Wraps for -2^31 times -2^31 with 63 fractional bits, as on the processors of Klipper's C.
         product = product.wrapping_add(1 << (frac_bits - 1)) >> frac_bits;
     }
     i32::try_from(product).map_err(|_| Overflow)

@@ -157,7 +157,7 @@ impl GuardianMonitor {
 mod tests {
     use super::super::heartbeat::{BEAT, IDLE};
     use super::*;
-    use pinion_firmware::time::{CLOCK_FREQ, Ticks};
+    use pinion_firmware::time::{CLOCK_FREQ, Ticks, TimeSource as _};
     use pinion_linux::clock::Monotonic;
 
     /// Highest difference that the stamps' resolution may cause.
