@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tells the program which state of the sources it is built from, and with which compiler. `pinion --version`, the
+//! Gives the program the state of its sources and the name of its compiler. `pinion --version`, the
 //! status and the data dictionary say it.
 
 use std::env;
@@ -8,7 +8,7 @@ use std::process::Command;
 /// The sources of the program.
 const SOURCES: [&str; 4] = ["../../src", "../../crates", "../../Cargo.toml", "../../Cargo.lock"];
 
-/// Where the sources are not a checkout of git, as when a package is built, whoever gives them may say
+/// Where the sources are not a checkout of git, as when a package is built, the builder may say
 /// which state they are of.
 const GIVEN: &str = "PINION_GIT_STATE";
 

@@ -31,7 +31,7 @@ struct BoardChip {
 }
 
 /// A board.
-pub(super) struct Board {
+pub(super) struct TestBoard {
     model: &'static str,
     /// Its file in Debian 13's kernel. `None` if the board has another device tree.
     device_tree: Option<&'static str>,
@@ -42,7 +42,7 @@ pub(super) struct Board {
     pwm: &'static [(u32, &'static str, u32)],
 }
 
-impl Board {
+impl TestBoard {
     /// The files by which Linux describes the board.
     pub(super) fn tree(&self) -> Tree {
         let tree = Tree::new();
@@ -117,13 +117,13 @@ fn named(names: &'static str) -> Vec<&'static str> {
 }
 
 /// A Raspberry Pi 4 with Debian.
-pub(super) fn pi4() -> Board {
+pub(super) fn pi4() -> TestBoard {
     let names = "ID_SDA ID_SCL SDA1 SCL1 GPIO_GCLK GPIO5 GPIO6 SPI_CE1_N SPI_CE0_N SPI_MISO SPI_MOSI SPI_SCLK GPIO12 \
                  GPIO13 TXD1 RXD1 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
                  RGMII_MDIO RGMIO_MDC CTS0 RTS0 TXD0 RXD0 SD1_CLK SD1_CMD SD1_DATA0 SD1_DATA1 SD1_DATA2 SD1_DATA3 \
                  PWM0_MISO PWM1_MOSI STATUS_LED_G_CLK SPIFLASH_CE_N SDA0 SCL0 RGMII_RXCLK RGMII_RXCTL RGMII_RXD0 \
                  RGMII_RXD1 RGMII_RXD2 RGMII_RXD3 RGMII_TXCLK RGMII_TXCTL RGMII_TXD0 RGMII_TXD1 RGMII_TXD2 RGMII_TXD3";
-    Board {
+    TestBoard {
         model: "Raspberry Pi 4 Model B",
         device_tree: Some("broadcom/bcm2711-rpi-4-b.dtb"),
         chips: vec![
@@ -150,12 +150,12 @@ pub(super) fn pi4() -> Board {
 }
 
 /// A Raspberry Pi Zero 2 with Debian.
-pub(super) fn zero2() -> Board {
+pub(super) fn zero2() -> TestBoard {
     let names = "ID_SDA ID_SCL SDA1 SCL1 GPIO_GCLK GPIO5 GPIO6 SPI_CE1_N SPI_CE0_N SPI_MISO SPI_MOSI SPI_SCLK GPIO12 \
                  GPIO13 TXD0 RXD0 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
                  HDMI_HPD_N STATUS_LED_N NC NC NC NC NC NC NC NC NC NC CAM_GPIO0 WL_ON BT_ON WIFI_CLK SDA0 SCL0 \
                  SMPS_SCL SMPS_SDA SD_CLK_R SD_CMD_R SD_DATA0_R SD_DATA1_R SD_DATA2_R SD_DATA3_R";
-    Board {
+    TestBoard {
         model: "Raspberry Pi Zero 2 W",
         device_tree: Some("broadcom/bcm2837-rpi-zero-2-w.dtb"),
         chips: vec![BoardChip {
@@ -197,7 +197,7 @@ fn rp1(number: u32, names: Vec<&'static str>) -> BoardChip {
 }
 
 /// A Raspberry Pi 5 with Raspberry Pi OS since July 2026.
-pub(super) fn pi5() -> Board {
+pub(super) fn pi5() -> TestBoard {
     let names = "ID_SDA ID_SCL GPIO2 GPIO3 GPIO4 GPIO5 GPIO6 GPIO7 GPIO8 GPIO9 GPIO10 GPIO11 GPIO12 GPIO13 GPIO14 \
                  GPIO15 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
                  PCIE_RP1_WAKE FAN_TACH HOST_SDA HOST_SCL ETH_RST_N - CD0_IO0_MICCLK CD0_IO0_MICDAT0 \
@@ -210,7 +210,7 @@ pub(super) fn pi5() -> Board {
         (14, "gpio-brcmstb@107d517c20", "soc/107d517c00.gpio", 6),
     ]);
     chips.push(rp1(15, named(names)));
-    Board {
+    TestBoard {
         model: "Raspberry Pi 5 Model B Rev 1.0",
         device_tree: None,
         chips,
@@ -220,7 +220,7 @@ pub(super) fn pi5() -> Board {
 }
 
 /// A Raspberry Pi 5 with Debian's backports. Its kernel gives the header's lines no names.
-pub(super) fn pi5_debian() -> Board {
+pub(super) fn pi5_debian() -> TestBoard {
     let mut chips = brcmstb(&[
         (0, "gpio-brcmstb@107d508500", "soc@107c000000/107d508500.gpio", 32),
         (1, "gpio-brcmstb@107d508520", "soc@107c000000/107d508500.gpio", 22),
@@ -228,16 +228,16 @@ pub(super) fn pi5_debian() -> Board {
         (3, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
     ]);
     chips.push(rp1(4, vec![]));
-    Board { model: "Raspberry Pi 5 Model B Rev 1.0", device_tree: None, chips, dev: &[], pwm: &[] }
+    TestBoard { model: "Raspberry Pi 5 Model B Rev 1.0", device_tree: None, chips, dev: &[], pwm: &[] }
 }
 
 /// A Raspberry Pi 5 with Debian 13. Its kernel has no driver for the header.
-pub(super) fn pi5_without_header() -> Board {
+pub(super) fn pi5_without_header() -> TestBoard {
     let chips = brcmstb(&[
         (0, "gpio-brcmstb@107d517c00", "soc@107c000000/107d517c00.gpio", 17),
         (1, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
     ]);
-    Board {
+    TestBoard {
         model: "Raspberry Pi 5 Model B Rev 1.0",
         device_tree: Some("broadcom/bcm2712-rpi-5-b.dtb"),
         chips,
@@ -247,10 +247,10 @@ pub(super) fn pi5_without_header() -> Board {
 }
 
 /// A BigTreeTech CB1 (Allwinner H616) with Debian. No line has a name.
-pub(super) fn cb1() -> Board {
+pub(super) fn cb1() -> TestBoard {
     let chip =
         |number, label, device, node, line_count| BoardChip { number, label, device, node, line_count, names: vec![] };
-    Board {
+    TestBoard {
         model: "BigTreeTech CB1",
         device_tree: Some("allwinner/sun50i-h616-bigtreetech-cb1-manta.dtb"),
         chips: vec![
@@ -263,7 +263,7 @@ pub(super) fn cb1() -> Board {
 }
 
 /// A Radxa ZERO 3W (Rockchip RK3566) with Debian. The names of its lines are not for klippy: they have a space.
-pub(super) fn rk3566() -> Board {
+pub(super) fn rk3566() -> TestBoard {
     let chip = |number, label, device, node, names: &[(usize, &'static str)]| {
         let mut all = vec![""; 32];
         names.iter().for_each(|(line, name)| all[*line] = name);
@@ -296,7 +296,7 @@ pub(super) fn rk3566() -> Board {
         (21, "pin-21 [GPIO4_C5]"),
         (22, "pin-24 [GPIO4_C6]"),
     ];
-    Board {
+    TestBoard {
         model: "Radxa ZERO 3W",
         device_tree: Some("rockchip/rk3566-radxa-zero-3w.dtb"),
         chips: vec![
@@ -367,6 +367,6 @@ fn nodes(blob: &[u8]) -> Nodes {
 }
 
 /// All of them.
-pub(super) fn all() -> Vec<Board> {
+pub(super) fn all() -> Vec<TestBoard> {
     vec![pi4(), zero2(), pi5(), pi5_debian(), pi5_without_header(), cb1(), rk3566()]
 }

@@ -118,7 +118,7 @@ pub(super) fn wire(link: &LinkName) -> Finding {
             if let Err(trouble) = uart::find_line(port) {
                 Finding::of("link", Level::Error, trouble)
             } else if access(port.as_path(), AccessFlags::R_OK | AccessFlags::W_OK).is_err() {
-                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev tells it)";
+                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev shows it)";
                 Finding::error("link", format!("{path} may not be opened by this user"), remedy)
             } else {
                 Finding::ok("link", format!("{link}: {path} is there"))
@@ -271,31 +271,31 @@ mod tests {
         let path = folder.path().join("tty");
         assert_eq!(link(&path).status, Level::Ok);
         std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
-        assert!(link(&path).told.cause.ends_with("is a link, and will be replaced"));
+        assert!(link(&path).trouble.cause.ends_with("is a link, and will be replaced"));
         fs::remove_file(&path).unwrap();
         fs::write(&path, "").unwrap();
         let refused = link(&path);
         assert_eq!(refused.status, Level::Error);
-        assert_eq!(refused.told.remedy.as_deref(), Some(&*format!("sudo rm {}", path.display())));
+        assert_eq!(refused.trouble.remedy.as_deref(), Some(&*format!("sudo rm {}", path.display())));
         let refused = link(folder.path());
         assert!(
-            refused.told.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")),
+            refused.trouble.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")),
             "{refused:?}"
         );
         let refused = link(&folder.path().join("none/tty"));
-        assert!(refused.status == Level::Error && refused.told.cause.contains("there is no folder"), "{refused:?}");
+        assert!(refused.status == Level::Error && refused.trouble.cause.contains("there is no folder"), "{refused:?}");
     }
 
     #[test]
     fn a_wire_that_is_not_there_yet_is_a_warning() {
         let told = |link: &str| wire(&link.parse().unwrap());
         let port = told("serial:/dev/none");
-        assert!(port.status == Level::Warning && port.told.cause.contains("there is no /dev/none"), "{port:?}");
+        assert!(port.status == Level::Warning && port.trouble.cause.contains("there is no /dev/none"), "{port:?}");
         let bus = told("can:none,0123456789ab");
         match can_open("none") {
-            Ok(()) => assert!(bus.told.cause.contains("there is no CAN interface none"), "{bus:?}"),
+            Ok(()) => assert!(bus.trouble.cause.contains("there is no CAN interface none"), "{bus:?}"),
             // This kernel has no CAN.
-            Err(trouble) => assert_eq!((bus.status, bus.told), (Level::Error, trouble)),
+            Err(trouble) => assert_eq!((bus.status, bus.trouble), (Level::Error, trouble)),
         }
         assert_eq!(told("stdio").status, Level::Ok);
     }

@@ -48,7 +48,7 @@ use super::{end, failed, logging, not_permitted};
 
 /// Longest wait for an answer of the MCU.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
-/// How often a console that waits for a line looks for messages of the MCU.
+/// How often a console that waits for a line checks for messages of the MCU.
 const LOOK: Duration = Duration::from_millis(20);
 /// How many lines are remembered.
 const HISTORY_LINES: usize = 1000;

@@ -42,40 +42,41 @@ pub(super) struct Finding {
     pub(super) check: &'static str,
     pub(super) status: Level,
     /// The state, and the remedy: a command or another step.
-    pub(super) told: Trouble,
+    pub(super) trouble: Trouble,
 }
 
 impl Serialize for Finding {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Finding { check, status, told } = self;
-        json!({ "check": check, "status": status, "found": told.found(), "remedy": told.remedy }).serialize(serializer)
+        let Finding { check, status, trouble } = self;
+        json!({ "check": check, "status": status, "found": trouble.found(), "remedy": trouble.remedy })
+            .serialize(serializer)
     }
 }
 
 impl Finding {
     /// The state is as it should be.
-    pub(super) fn ok(check: &'static str, told: impl Into<Trouble>) -> Finding {
-        Finding::of(check, Level::Ok, told)
+    pub(super) fn ok(check: &'static str, trouble: impl Into<Trouble>) -> Finding {
+        Finding::of(check, Level::Ok, trouble)
     }
 
     /// The state may be a reason why something does not work well.
-    pub(super) fn warning(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
-        Finding::of(check, Level::Warning, told).or(remedy)
+    pub(super) fn warning(check: &'static str, trouble: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
+        Finding::of(check, Level::Warning, trouble).or(remedy)
     }
 
     /// The state is the reason why something does not work.
-    pub(super) fn error(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
-        Finding::of(check, Level::Error, told).or(remedy)
+    pub(super) fn error(check: &'static str, trouble: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
+        Finding::of(check, Level::Error, trouble).or(remedy)
     }
 
-    /// A finding of this level, with the remedy in `told`.
-    pub(super) fn of(check: &'static str, status: Level, told: impl Into<Trouble>) -> Finding {
-        Finding { check, status, told: told.into() }
+    /// A finding of this level, with the remedy in `trouble`.
+    pub(super) fn of(check: &'static str, status: Level, trouble: impl Into<Trouble>) -> Finding {
+        Finding { check, status, trouble: trouble.into() }
     }
 
     /// The same with a remedy, for a state that is fine but may be unwanted.
     pub(super) fn or(self, remedy: impl Into<Box<str>>) -> Finding {
-        Finding { told: self.told.remedy(remedy), ..self }
+        Finding { trouble: self.trouble.remedy(remedy), ..self }
     }
 }
 
@@ -97,9 +98,9 @@ pub(super) fn text(groups: &[Group]) -> Page {
     let mut page = Page::default();
     for Group { name, findings } in groups.iter().filter(|group| !group.findings.is_empty()) {
         page.line(name);
-        for Finding { status, told, .. } in findings {
-            page.line(format_args!("  {:<8} {}", status.name(), told.found()));
-            if let Some(remedy) = &told.remedy {
+        for Finding { status, trouble, .. } in findings {
+            page.line(format_args!("  {:<8} {}", status.name(), trouble.found()));
+            if let Some(remedy) = &trouble.remedy {
                 page.line(format_args!("           -> {remedy}"));
             }
         }

@@ -15,7 +15,7 @@ use clap::Args;
 use pinion_linux::gpio::FastGpio;
 
 use pinion_firmware::lateness::{Lateness, us};
-use pinion_runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
+use pinion_runtime::latency::{Assessment, Fitness, Half, judge, measure_both};
 
 use super::complete::offering;
 use super::computer::Computer;
@@ -71,7 +71,7 @@ pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     print(&Page::text(&report(&halves, &verdict))).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
-fn report(halves: &[Half; 2], verdict: &Verdict) -> String {
+fn report(halves: &[Half; 2], verdict: &Assessment) -> String {
     let mut text = String::new();
     for Half { name, wakeup, edge, margin } in halves {
         let _ = writeln!(text, "{name}:\n  wake-ups  {wakeup}\n  edges     {edge}  (margin {:.1} us)", us(*margin));

@@ -245,7 +245,7 @@ impl List {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::boards::{self, Board};
+    use crate::cli::boards::{self, TestBoard};
     use pinion_linux::adc::{Channel, Format, IioDevice};
     use pinion_linux::gpio::LineInfo;
     use pinion_linux::pins::{Names, line_number};
@@ -368,7 +368,7 @@ Serial ports
     }
 
     /// The lines of `pinion pins` on a board, for this filter, without their headings.
-    fn on_board(board: &Board, filter: &str) -> Vec<String> {
+    fn on_board(board: &TestBoard, filter: &str) -> Vec<String> {
         let tree = board.tree();
         let (inventory, sysfs) = (board.inventory(&tree), Sysfs::scan(&tree.computer().path("/")));
         let args = PinsArgs { filter: Some(filter.into()), ..PinsArgs::default() };
@@ -380,7 +380,7 @@ Serial ports
 
     #[test]
     fn boards_that_people_own() {
-        let lines = |board: Board, filter: &str| on_board(&board, filter);
+        let lines = |board: TestBoard, filter: &str| on_board(&board, filter);
         assert_eq!(lines(boards::pi4(), "gpio17"), ["17 GPIO17 in free GPIO17, gpio17"]);
         assert_eq!(lines(boards::pi4(), "gpio14"), ["14 TXD1 in free TXD1, gpio14"]);
         assert_eq!(

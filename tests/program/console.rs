@@ -155,7 +155,7 @@ fn at_a_terminal_tab_completes_and_lines_are_remembered() {
     let link = pinion.link();
     for times in [1, 2] {
         let mut person = person(&[link.to_str().unwrap()], state.path());
-        person.until("help tells of them");
+        person.until("help lists them");
         person.until("> ");
         if times == 1 {
             person.press("get_up\t\r");
@@ -183,7 +183,7 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
     for args in [&[link.to_str().unwrap()] as &[&str], &["--board", "sim"]] {
         for signal in [Signal::SIGTERM, Signal::SIGHUP, Signal::SIGQUIT] {
             let mut person = person(args, state.path());
-            person.until("help tells of them");
+            person.until("help lists them");
             // The line editor has the terminal, and the person has begun a line.
             person.until("> ");
             person.press("get_upt");
@@ -259,7 +259,7 @@ fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
 fn what_the_mcu_says_meanwhile_is_printed_at_once() {
     let state = tempfile::tempdir().unwrap();
     let mut person = person(&["--board", "sim"], state.path());
-    person.until("help tells of them");
+    person.until("help lists them");
     for line in OUTPUT.lines() {
         person.press(&format!("{line}\r"));
     }

@@ -221,9 +221,9 @@ fn a_host_that_hangs_behind_ssh_is_no_cut() {
     let mcu = Pinion::simulated(&[]);
     let near = near(&mcu.link(), "");
     let mut host = near.client();
-    // `pinion link` gives a sign of life after two seconds of silence.
+    // `pinion link` sends a keepalive after two seconds of silence.
     begin(&mut host, 3.0 * HEAT_S);
     mcu.logged("shutdown: Missed scheduling of next digital out event");
     let verdict = mcu.logged("the host sent no commands for");
-    assert!(verdict.contains("but its computer gave a sign of life"), "{verdict}");
+    assert!(verdict.contains("but its computer sent keepalives"), "{verdict}");
 }

@@ -164,7 +164,7 @@ fn an_attach_that_hears_nothing_gives_the_terminal_back() {
     let mut sign = [0; 1];
     child.stdout.as_mut().unwrap().read_exact(&mut sign).unwrap();
     assert_eq!(sign, *b"~");
-    // A sign of life is no host.
+    // A keepalive is no host.
     let mut input = child.stdin.take().unwrap();
     input.write_all(b"~").unwrap();
     let output = child.wait_with_output().unwrap();

@@ -86,7 +86,7 @@ impl Console {
     pub fn greeting(&self) -> String {
         let dictionary = self.client.dictionary();
         format!(
-            "{} {}: {} commands; help tells of them",
+            "{} {}: {} commands; help lists them",
             if dictionary.app.is_empty() { "a micro-controller" } else { &dictionary.app },
             dictionary.version,
             dictionary.commands.len()
@@ -116,7 +116,7 @@ impl Console {
                 self.listen(Duration::from_secs_f64(seconds), print)?;
             }
             ("reset", []) => {
-                self.client.reset().map_err(told)?;
+                self.client.reset().map_err(message)?;
                 self.client.drain();
                 self.vocabulary = Vocabulary::new(self.client.dictionary(), self.client.messages());
                 print("the MCU waits for a new configuration");
@@ -140,10 +140,10 @@ impl Console {
         }
         let payload = self.client.messages().encode_line(&line).map_err(|error| match error {
             Error::Message { why, .. } => format!("{why}{} (it is {format})", self.vocabulary.hint(command, rest)),
-            other => told(other),
+            other => message(other),
         })?;
         let link = self.client.link();
-        link.send(&payload).and_then(|()| link.settle()).map_err(told)?;
+        link.send(&payload).and_then(|()| link.settle()).map_err(message)?;
         let stopped = self.print_heard(Instant::now(), print)?;
         match stopped {
             Some(reason) if command != "emergency_stop" => Err(reason),
@@ -173,7 +173,7 @@ impl Console {
     fn print_heard(&mut self, until: Instant, print: &mut dyn FnMut(&str)) -> Result<Option<String>, String> {
         let heard = self.client.hear(until).map_err(|error| {
             self.gone = matches!(error, Error::Closed { .. } | Error::Io { .. });
-            told(error)
+            message(error)
         })?;
         // A stopped MCU also answers queries, for example for the clock.
         self.client.forget_shutdown();
@@ -230,7 +230,7 @@ impl Console {
             let Some(seconds) = seconds else {
                 return Err(format!("{word}: an instant is clock, clock+0.5s or clock-1ms"));
             };
-            self.client.clock_in(seconds).map_err(told)?.wire()
+            self.client.clock_in(seconds).map_err(message)?.wire()
         } else if let Some(seconds) = seconds(value) {
             let ticks = (seconds * self.client.frequency_hz()).round();
             if ticks > f64::from(u32::MAX) {
@@ -253,7 +253,7 @@ fn seconds(text: &str) -> Option<f64> {
     number.parse::<f64>().ok().filter(|_| is_number).map(|number| number * unit)
 }
 
-fn told(error: Error) -> String {
+fn message(error: Error) -> String {
     error.to_string()
 }
 

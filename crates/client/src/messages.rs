@@ -300,7 +300,7 @@ impl Messages {
                     let enumeration = parameter.enumeration.and_then(|index| self.enumerations.get(index));
                     let value = enumeration
                         .and_then(|e| e.value(name))
-                        .ok_or_else(|| wrong(format!("`{name}` is none of the names that {} takes", parameter.name)))?;
+                        .ok_or_else(|| wrong(format!("`{name}` is not a value of {}", parameter.name)))?;
                     writer.int(value);
                 }
                 _ => {

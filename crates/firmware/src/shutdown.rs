@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Why the MCU stops: the firmware's short text for the wire, and a long text for the log.
+//! Why the MCU stops: Klipper's short text for the wire, and a long text for the log.
 
 #![forbid(unsafe_code)]
 
@@ -8,7 +8,7 @@ use std::fmt;
 use crate::time::Clock;
 use crate::trouble::Trouble;
 
-/// A shutdown text of the firmware, as the host sees it. The wording is Klipper's own: klippy shows the text to the
+/// A shutdown text of Klipper's C, as the host sees it. The wording is Klipper's own: klippy shows the text to the
 /// user and matches some texts (`klippy/extras/error_mcu.py`).
 ///
 /// [`shutdowns!`] declares one. The dictionary numbers the texts that the features list, in its enumeration
@@ -102,7 +102,7 @@ pub mod reason {
         pub CHIP_OPEN = "Unable to open GPIO chip device";
         /// A chip does not exist.
         pub CHIP_MISSING = "GPIO chip device not found";
-        /// A write to a claimed line failed (Pinion's own text: the firmware does not notice this).
+        /// A write to a claimed line failed (Pinion's own text: Klipper's C does not notice this).
         pub LINE_WRITE = "GPIO line write failed";
         /// A read of a claimed line failed (Pinion's own text).
         pub LINE_READ = "GPIO line read failed";

@@ -125,7 +125,7 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// Timing by this clock, with timers at most 100 ms late and steps at most 1 ms, as in the firmware.
+    /// Timing by this clock, with timers at most 100 ms late and steps at most 1 ms, as in Klipper's C.
     pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
         Timing { clock, due: Due::default(), late_limit: Ticks::from_ms(100), step_late_limit: Ticks::from_ms(1) }
     }

@@ -64,7 +64,7 @@ impl TimeSource for Monotonic {
 /// The kernel's tick, when [`watch_tick`] has found it.
 static TICK: OnceLock<KernelTick> = OnceLock::new();
 
-/// Starts a thread that looks for the kernel's tick, for [`TimeSource::tick_after`]. It takes some ten ticks.
+/// Starts a thread that finds the kernel's tick, for [`TimeSource::tick_after`]. It takes some ten ticks.
 ///
 /// # Errors
 ///
@@ -116,7 +116,7 @@ impl KernelTick {
     /// How many ticks must have been seen, and how many are watched for that.
     const SEEN: usize = 7;
     const WATCHED: usize = 50;
-    /// How long a tick may keep the watching thread from its looks. After a longer time it was something else.
+    /// How long a tick may interrupt the watching thread. A longer pause had another cause.
     const LONGEST: Duration = Duration::from_micros(100);
 
     /// Watches ticks. A tick sets CLOCK_MONOTONIC_COARSE, whose resolution is the time between two ticks.
@@ -149,7 +149,7 @@ impl KernelTick {
         None
     }
 
-    /// The tick that began at these times. Another processor may see it later, and one look may have been too early.
+    /// The tick that began at these times. Another processor may see it later, and one read may have been too early.
     /// `None` if they are not times of one tick.
     fn of(mut seen_ns: [u64; KernelTick::SEEN], every_ns: u64) -> Option<KernelTick> {
         let after = |from: u64, to: u64| (to % every_ns + every_ns - from % every_ns) % every_ns;

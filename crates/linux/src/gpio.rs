@@ -16,8 +16,8 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use gpio_cdev::{LineHandle, LineRequestFlags};
 
-use super::GPIO;
 use super::guard::SharedGuard;
+use crate::places::GPIO;
 use crate::sys;
 use pinion_firmware::board::{Bank, Bias, Direction, Line};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};

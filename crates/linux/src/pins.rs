@@ -22,8 +22,8 @@
 use std::collections::HashMap;
 use std::fmt;
 
-use super::Inventory;
 use super::spi::Node;
+use crate::Inventory;
 use pinion_firmware::board::{Pin, Range};
 
 /// How many chips have pin numbers in the C program. Before August 2026 it had 9.

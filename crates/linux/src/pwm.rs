@@ -129,7 +129,7 @@ impl Pwm {
         Shutdown::because(reason::PWM_CONFIG, trouble(error, cause).of(self.channel))
     }
 
-    /// Tells the guardian what to set the channel to if the program dies.
+    /// Gives the guardian the values of the channel for a program that dies.
     fn watch_over(&self, shutdown_value: u16) -> Result<(), Shutdown> {
         let name = self.channel.to_string();
         if shutdown_value == 0 {

@@ -80,8 +80,8 @@ pub(super) fn ranges(nodes: &[Node]) -> Vec<Range> {
 
 /// The longest transfer that the driver accepts: its parameter `bufsiz`.
 pub(super) fn message_max() -> usize {
-    let told = fs::read_to_string("/sys/module/spidev/parameters/bufsiz").ok();
-    told.and_then(|text| text.trim().parse().ok()).unwrap_or(4096)
+    let read = fs::read_to_string("/sys/module/spidev/parameters/bufsiz").ok();
+    read.and_then(|text| text.trim().parse().ok()).unwrap_or(4096)
 }
 
 /// SPI_CPOL of a mode: the clock idles high.
@@ -89,8 +89,8 @@ const CPOL: u32 = SpiModeFlags::SPI_CPOL.bits();
 /// SPI_MOSI_IDLE_LOW of a mode: the data output is low between two messages. Few kernels and controllers support it.
 const MOSI_IDLE_LOW: u32 = 1 << 17;
 
-/// The shared state of one controller's chips. One worker talks to all of them, so the order of their conversations is
-/// clear.
+/// The shared state of one controller's chips. One worker makes the transfers of all of them, one
+/// after the other.
 #[derive(Default)]
 pub(super) struct Controller {
     /// The current mode of each node, by its chip select. Chips with GPIO lines as chip selects may share a node and
@@ -244,7 +244,7 @@ impl<N: SpiNode> Spi<N> {
             0 => self.drive(ChipSelect::pulse),
             _ => {
                 let transferred = self.drive(|line| line.select(true)).and_then(|()| self.transfer(bytes));
-                // A chip that stayed selected after a failure would disturb the next conversation.
+                // A chip that stayed selected after a failure would disturb the next transfer.
                 let deselected = self.drive(|line| line.select(false));
                 transferred.and(deselected)
             }

@@ -78,7 +78,7 @@ fn is_pseudo(terminal: &File) -> bool {
 }
 
 /// Opens the terminal at this path: raw, with eight data bits, no parity and one stop bit. No other program may open it
-/// meanwhile. The lock keeps out programs that ask for it, even those of root.
+/// until the file is closed. The lock keeps out programs that ask for it, even those of root.
 fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
     let flags = libc::O_NOCTTY | libc::O_NONBLOCK;
     let file = OpenOptions::new()
@@ -121,7 +121,7 @@ pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
             return Err(no_port(Errno::ENOTTY));
         }
         let name = target.file_name().unwrap_or_default().to_string_lossy();
-        let consoles = sysfs::text(&Path::new(crate::TTY).join("console/active")).unwrap_or_default();
+        let consoles = sysfs::text(&Path::new(crate::places::TTY).join("console/active")).unwrap_or_default();
         if consoles.split_whitespace().any(|console| console == name) {
             return Err(console());
         }

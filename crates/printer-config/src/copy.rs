@@ -69,7 +69,7 @@ fn changed(
     let mut lines: Vec<String> = text.split('\n').map(str::to_owned).collect();
     let change_of = |section: &str| changes.iter().find(|change| change.section == section);
     for entry in config.entries.iter().filter(|entry| entry.file == *path) {
-        if !change_of(&entry.section).is_some_and(|change| change.without.contains(&entry.key)) {
+        if !change_of(&config.sections[entry.section].name).is_some_and(|change| change.without.contains(&entry.key)) {
             continue;
         }
         for number in entry.lines.clone() {

@@ -60,7 +60,7 @@ impl Files for Disk {
             };
             found = match literal.map(Pattern::new) {
                 Some(Ok(pattern)) => expand(&found, &pattern, &mut names)?,
-                // Python takes a pattern that is none as a name.
+                // Python takes a wrong pattern as a name.
                 Some(Err(_)) | None => found.into_iter().map(|path| path.join(component)).collect(),
             };
         }

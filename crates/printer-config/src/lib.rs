@@ -6,7 +6,7 @@
 //! - [`pins`]: names of pins, `[board_pins]` and uses
 //! - [`copy`]: a copy of all files in a folder of its own, in which chosen options differ
 //!
-//! The files may come from anybody. Each is bounded, and so is their number.
+//! The files may come from anybody. Each is bounded, and so are the numbers of files, includes, sections and options.
 
 #![forbid(unsafe_code)]
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
@@ -26,6 +26,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 pub use files::{Disk, Files};
+pub use parse::included;
 pub use pinion_firmware::trouble::Trouble;
 pub use values::Limit;
 
@@ -63,13 +64,15 @@ pub struct Section {
     /// The line that opens it first.
     pub place: Place,
     settings: Vec<Setting>,
+    by_key: HashMap<String, usize>,
 }
 
 /// The lines of an option in a file, for a copy of the file.
 #[derive(Clone, Debug)]
 pub(crate) struct Entry {
     pub(crate) file: Arc<Path>,
-    pub(crate) section: String,
+    /// Its index in [`Config::sections`].
+    pub(crate) section: usize,
     pub(crate) key: String,
     pub(crate) lines: RangeInclusive<usize>,
 }
@@ -115,6 +118,11 @@ impl Config {
     /// The sections with this first word: the one with this name, and those with another word behind it.
     pub fn of_kind(&self, kind: &str) -> impl Iterator<Item = &Section> {
         self.sections.iter().filter(move |section| section.kind() == kind)
+    }
+
+    /// The files that open a section, once for each line that does.
+    pub fn files_of(&self, section: &str) -> impl Iterator<Item = &Path> {
+        self.headers.iter().filter(move |(name, _)| name == section).map(|(_, place)| &*place.file)
     }
 
     /// The path of each file that was read, the main one first.

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -24,6 +25,11 @@ pub(crate) struct Line<'a> {
 pub(crate) fn header(line: &str) -> Option<&str> {
     let rest = line.strip_prefix('[')?;
     rest.rfind(']').map(|end| &rest[..end]).filter(|name| !name.is_empty())
+}
+
+/// The pattern of a line that includes files: `[include macros/*.cfg]`.
+pub fn included(line: &str) -> Option<&str> {
+    header(uncommented(line)).and_then(|name| name.strip_prefix("include ")).map(str::trim)
 }
 
 /// A line before its `#`.
@@ -89,9 +95,6 @@ impl Config {
             };
             open = Some(self.set(section, key.trim().to_lowercase(), text.trim(), &place).map_err(at)?);
         }
-        for section in &mut self.sections {
-            section.settings.iter_mut().for_each(|setting| setting.value.truncate(setting.value.trim_end().len()));
-        }
         Ok(())
     }
 
@@ -105,7 +108,7 @@ impl Config {
             return Err(Trouble::new(cause).remedy("remove the sections that do not belong to a printer"));
         }
         self.by_name.insert(name.to_owned(), self.sections.len());
-        self.sections.push(Section { name: name.to_owned(), place, settings: Vec::new() });
+        self.sections.push(Section { name: name.to_owned(), place, settings: Vec::new(), by_key: HashMap::new() });
         Ok(self.sections.len() - 1)
     }
 
@@ -117,16 +120,16 @@ impl Config {
             return Err(Trouble::new(cause).remedy("remove the options that do not belong to a printer"));
         }
         let lines = place.line..=place.line;
-        let name = self.sections[section].name.clone();
-        self.entries.push(Entry { file: place.file.clone(), section: name, key: key.clone(), lines });
-        let settings = &mut self.sections[section].settings;
+        self.entries.push(Entry { file: place.file.clone(), section, key: key.clone(), lines });
+        let Section { settings, by_key, .. } = &mut self.sections[section];
         let new = Setting { key, value: value.to_owned(), place: place.clone() };
-        let setting = match settings.iter().position(|setting| setting.key == new.key) {
+        let setting = match by_key.get(&new.key) {
             Some(known) => {
-                settings[known] = new;
-                known
+                settings[*known] = new;
+                *known
             }
             None => {
+                by_key.insert(new.key.clone(), settings.len());
                 settings.push(new);
                 settings.len() - 1
             }

@@ -7,11 +7,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::files::{Disk, Files, is_pattern};
-use crate::parse::{Line, header, uncommented};
+use crate::parse::{Line, included, uncommented};
 use crate::{Config, Include, Place, SourceFile, Trouble};
 
 /// Highest number of files, each counted as often as it is included.
 const FILES_MAX: usize = 500;
+/// Highest number of includes, also of those that find no file: each searches a folder.
+const INCLUDES_MAX: usize = 1000;
 /// Highest number of bytes in all files.
 const BYTES_MAX: usize = 16 << 20;
 /// The head of the block that klippy's SAVE_CONFIG writes.
@@ -48,6 +50,9 @@ impl Config {
         reader.include(&file, usual)?;
         let mut config = reader.config;
         config.add_saved(&file, usual.matches('\n').count(), &saved)?;
+        for setting in config.sections.iter_mut().flat_map(|section| &mut section.settings) {
+            setting.value.truncate(setting.value.trim_end().len());
+        }
         config.files.insert(0, SourceFile { path: file, text });
         Ok(config)
     }
@@ -120,15 +125,14 @@ impl Reader<'_> {
         self.within.push(whole);
         let mut lines = Vec::new();
         for (number, text) in (1..).zip(text.split('\n')) {
-            let text = uncommented(text);
-            let Some(pattern) = header(text).and_then(|name| name.strip_prefix("include ")) else {
-                lines.push(Line { number, text });
+            let Some(pattern) = included(text) else {
+                lines.push(Line { number, text: uncommented(text) });
                 continue;
             };
             self.config.add(file, &lines)?;
             lines.clear();
             let place = Place { file: file.clone(), line: number };
-            self.matching(&place, pattern.trim()).map_err(|trouble| trouble.of(&place))?;
+            self.matching(&place, pattern).map_err(|trouble| trouble.of(&place))?;
         }
         self.config.add(file, &lines)?;
         self.within.pop();
@@ -137,6 +141,11 @@ impl Reader<'_> {
 
     /// Reads the files of an include.
     fn matching(&mut self, place: &Place, pattern: &str) -> Result<(), Trouble> {
+        if self.config.includes.len() == INCLUDES_MAX {
+            return Err(
+                Trouble::new(format!("there are more than {INCLUDES_MAX} includes")).remedy("include fewer files")
+            );
+        }
         let pattern = place.file.parent().unwrap_or(Path::new("")).join(pattern);
         let found = self.files.matching(&pattern).map_err(|error| {
             Trouble::new(format!("Include file '{}': {error}", pattern.display())).remedy("name fewer files")

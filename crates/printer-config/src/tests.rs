@@ -140,6 +140,10 @@ fn hostile_configurations_end_at_once_with_a_line() {
     refused(&sections, "p.cfg:5001: there are more than 5000 sections");
     let options: String = (0..60_000).map(|n| format!("k{}: 1\n", n % 100)).collect();
     refused(&format!("[s]\n{options}"), "there are more than 50000 options");
+    refused(&"[include none*.cfg]\n".repeat(2000), "p.cfg:1001: there are more than 1000 includes");
+    // The name of a section is kept once, not once for each option.
+    let (name, options) = ("s".repeat(1 << 20), (0..40_000).map(|n| format!("k{n}: 1\n")).collect::<String>());
+    assert_eq!(read(&format!("[{name}]\n{options}")).sections()[0].settings().len(), 40_000);
     // Each file includes the next one twice.
     let names: Vec<String> = (0..30).map(|n| format!("{n}.cfg")).collect();
     let texts: Vec<String> = (1..31).map(|n| format!("[include {n}.cfg]\n[include {n}.cfg]\n")).collect();

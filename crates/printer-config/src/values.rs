@@ -40,7 +40,7 @@ impl Section {
 
     /// An option.
     pub fn setting(&self, key: &str) -> Option<&Setting> {
-        self.settings.iter().find(|setting| setting.key == key)
+        self.by_key.get(key).map(|place| &self.settings[*place])
     }
 
     /// The place of an option, or of the section.
@@ -103,7 +103,7 @@ impl Section {
     ///
     /// # Errors
     ///
-    /// It is none, or out of its range.
+    /// It is not a number, or out of its range.
     pub fn number(&self, key: &str, limit: Limit) -> Result<Option<f64>, Trouble> {
         let number = self.parsed(key, python_float)?;
         number.map_or(Ok(()), |number| self.bounded(key, number, limit)).map(|()| number)
@@ -113,7 +113,7 @@ impl Section {
     ///
     /// # Errors
     ///
-    /// It is none, or below `min`.
+    /// It is not a whole number, or below `min`.
     pub fn whole(&self, key: &str, min: i64) -> Result<Option<i64>, Trouble> {
         let number = self.parsed(key, python_int)?;
         match number {
@@ -129,7 +129,7 @@ impl Section {
     ///
     /// # Errors
     ///
-    /// It is none.
+    /// It is another word.
     pub fn truth(&self, key: &str) -> Result<Option<bool>, Trouble> {
         self.parsed(key, |text| match text.to_lowercase().as_str() {
             "1" | "yes" | "true" | "on" => Some(true),
@@ -150,7 +150,7 @@ impl Section {
     ///
     /// # Errors
     ///
-    /// One of them is none.
+    /// One of them is not a number.
     pub fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, Trouble> {
         self.parsed(key, |text| match text {
             "" => Some(Vec::new()),
@@ -162,7 +162,7 @@ impl Section {
     ///
     /// # Errors
     ///
-    /// One of them is none.
+    /// One of them is not a number.
     pub fn rows(&self, key: &str) -> Result<Option<Vec<Vec<f64>>>, Trouble> {
         self.parsed(key, |text| {
             let rows = text.lines().map(str::trim).filter(|line| !line.is_empty());

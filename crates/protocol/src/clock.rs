@@ -47,7 +47,7 @@ impl Clock {
         near.displaced(wire.wrapping_sub(near.wire()))
     }
 
-    /// This time displaced by a span that wraps as in the firmware's 32-bit clocks. A span of 2^31 ticks or more leads
+    /// This time displaced by a span that wraps as in Klipper's 32-bit clocks. A span of 2^31 ticks or more leads
     /// into the past.
     pub const fn displaced(self, ticks: u32) -> Clock {
         Clock(self.0.wrapping_add_signed(ticks as i32 as i64))

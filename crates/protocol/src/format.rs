@@ -83,7 +83,7 @@ pub trait Field {
 
 macro_rules! integers {
     ($($t:ty: $($conversion:literal)|+;)*) => {$(
-        // The firmware uses an integer's low bits, for every conversion.
+        // Klipper's C uses an integer's low bits, for every conversion.
         impl Arg<'_> for $t {
             const CONVERSIONS: &'static [&'static str] = &[$($conversion),+];
             #[inline]

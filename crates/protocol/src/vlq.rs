@@ -29,7 +29,7 @@ impl<'a> Reader<'a> {
         self.0
     }
 
-    /// The next integer, modulo 2^32. A longer encoding wraps, as in the firmware.
+    /// The next integer, modulo 2^32. A longer encoding wraps, as in Klipper's C.
     #[inline]
     pub fn int(&mut self) -> Result<u32, Malformed> {
         let mut byte = self.byte()?;

@@ -34,7 +34,7 @@ pub struct Half {
 
 /// Measures for `span` while idle, then as long under load.
 pub fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
-    let processors = Processors::new(None).map_err(|error| format!("the processors cannot be told: {error}"))?;
+    let processors = Processors::new(None).map_err(|error| format!("the processors are unknown: {error}"))?;
     in_thread(move || {
         realtime::lock_memory();
         let scheduling = realtime::enter(Role::Core);
@@ -50,7 +50,7 @@ pub fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
 /// Measures for `span` while Pinion serves a host. It runs below Pinion's priority, without load or spinning. So it
 /// does not delay Pinion.
 fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
-    let processors = Processors::new(None).map_err(|error| format!("the processors cannot be told: {error}"))?;
+    let processors = Processors::new(None).map_err(|error| format!("the processors are unknown: {error}"))?;
     in_thread(move || {
         let scheduling = realtime::enter(Role::Worker);
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
@@ -73,7 +73,7 @@ fn in_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Re
 }
 
 /// Measures the latency for two seconds. While Pinion serves a host, it measures gently.
-pub fn sample(is_serving: bool) -> Result<Verdict, String> {
+pub fn sample(is_serving: bool) -> Result<Assessment, String> {
     const SPAN: Duration = Duration::from_secs(2);
     if is_serving {
         let (scheduling, half) = measure_beside(SPAN)?;
@@ -168,7 +168,7 @@ pub enum Fitness {
 }
 
 /// The uses that the measurements allow.
-pub struct Verdict {
+pub struct Assessment {
     /// The outputs.
     pub fitness: Fitness,
     /// The figure that decided.
@@ -187,7 +187,7 @@ impl std::fmt::Display for Fitness {
     }
 }
 
-impl std::fmt::Display for Verdict {
+impl std::fmt::Display for Assessment {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}: {}", self.fitness, self.why)?;
         match &self.remedy {
@@ -205,7 +205,7 @@ const STEPPERS_MAX_US: f64 = 1000.0;
 const SLOW_MAX_US: f64 = 50_000.0;
 
 /// Says what the measurements of both halves allow.
-pub fn judge(halves: &[Half], scheduling: Scheduling) -> Verdict {
+pub fn judge(halves: &[Half], scheduling: Scheduling) -> Assessment {
     let worst = |q: fn(&Lateness) -> Ticks| halves.iter().map(|half| us(q(&half.edge))).fold(0.0, f64::max);
     let p999 = worst(|lateness| lateness.quantile(0.999));
     let max = worst(Lateness::max);
@@ -215,7 +215,7 @@ pub fn judge(halves: &[Half], scheduling: Scheduling) -> Verdict {
         () => Fitness::Nothing,
     };
     let why = format!("999 of 1000 edges came within {p999:.1} us, the latest {max:.1} us late");
-    Verdict { fitness, why, remedy: remedy(fitness, scheduling) }
+    Assessment { fitness, why, remedy: remedy(fitness, scheduling) }
 }
 
 fn remedy(fitness: Fitness, scheduling: Scheduling) -> Option<String> {

@@ -119,12 +119,12 @@ impl Text<'_> {
 
 /// Words that show since when a worker is at its present job (0 without one), and the worker's name.
 #[derive(Clone, Copy, Debug)]
-pub struct JobSlot<'a>(&'a [AtomicU32]);
+pub struct WorkerSlot<'a>(&'a [AtomicU32]);
 
-impl<'a> JobSlot<'a> {
+impl<'a> WorkerSlot<'a> {
     /// A view of these words, more than one.
-    pub fn new(words: &'a [AtomicU32]) -> JobSlot<'a> {
-        JobSlot(words)
+    pub fn new(words: &'a [AtomicU32]) -> WorkerSlot<'a> {
+        WorkerSlot(words)
     }
 
     /// A slot without a name is free. Only one thread gives slots to workers.

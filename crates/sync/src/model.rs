@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed as Std};
 
 use crate::atomic::{AtomicU32, AtomicU64, Ordering};
-use crate::heartbeat::{JobSlot, SharedHeartbeat};
+use crate::heartbeat::{SharedHeartbeat, WorkerSlot};
 use crate::progress::Progress;
 use crate::ring::{self, Found, Ring};
 use crate::seqlock::Seqlock;
@@ -174,14 +174,14 @@ fn a_beat_is_as_new_as_its_limit() {
 }
 
 #[test]
-fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
+fn a_pending_value_has_its_subject_and_begins_and_ends_with_a_beat() {
     let start = || {
         let words = words::<5>();
         SharedHeartbeat::new(&words).beat(1, RUNNING);
         words
     };
     model(
-        "heart: a debt begins",
+        "heart: a value is pending",
         start,
         |words| {
             SharedHeartbeat::new(words).set_pending("pwmchip0", 5);
@@ -197,7 +197,7 @@ fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
         },
     );
     model(
-        "heart: a debt ends",
+        "heart: no value is pending",
         move || {
             let words = start();
             SharedHeartbeat::new(&words).set_pending("pwmchip0", 5);
@@ -213,14 +213,14 @@ fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
 fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
     let start = || {
         let words = words::<3>();
-        JobSlot::new(&words).name().set("old");
-        JobSlot::new(&words).begin(1);
+        WorkerSlot::new(&words).name().set("old");
+        WorkerSlot::new(&words).begin(1);
         words
     };
     // A third thread, the old worker, frees the slot.
     let replace = |words: &[AtomicU32; 3]| {
-        if !JobSlot::new(words).name().is_set() {
-            JobSlot::new(words).name().set("new one");
+        if !WorkerSlot::new(words).name().is_set() {
+            WorkerSlot::new(words).name().set("new one");
         }
     };
     let check = |name: String, busy: Option<u32>| {
@@ -229,18 +229,18 @@ fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
     model(
         "slot: a worker ends, another begins",
         start,
-        |words| JobSlot::new(words).free(),
+        |words| WorkerSlot::new(words).free(),
         replace,
-        move |words, (), ()| check(JobSlot::new(words).name().get(), JobSlot::new(words).busy_since()),
+        move |words, (), ()| check(WorkerSlot::new(words).name().get(), WorkerSlot::new(words).busy_since()),
     );
     model(
-        "slot: a look at it",
+        "slot: a reader",
         start,
         move |words| {
-            JobSlot::new(words).free();
+            WorkerSlot::new(words).free();
             replace(words);
         },
-        |words| (JobSlot::new(words).name().get(), JobSlot::new(words).busy_since()),
+        |words| (WorkerSlot::new(words).name().get(), WorkerSlot::new(words).busy_since()),
         move |_, (), (name, busy)| check(name, busy),
     );
 }

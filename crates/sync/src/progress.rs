@@ -80,7 +80,7 @@ impl Progress {
 
     /// The link is about to hand the core a stop request, such as a block with `emergency_stop`.
     pub fn stop_handed(&self) {
-        // The ring that hands the request over also shows this count to whoever finds the request there.
+        // The ring that hands the request over also shows this count to the thread that finds the request there.
         self.stops_handed.fetch_add(1, Ordering::Relaxed);
     }
 

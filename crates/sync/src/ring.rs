@@ -93,7 +93,7 @@ impl<'a> Ring<'a> {
 
     /// The oldest record of which all copies made so far are whole.
     fn oldest_whole(self) -> u64 {
-        // Pairs with the fence of the writer: whoever saw a word of record N here sees a count of N or above.
+        // Pairs with the fence of the writer: a reader that saw a word of record N sees a count of N or above.
         fence(Ordering::Acquire);
         let now = self.head[WRITTEN].load(Ordering::Relaxed);
         // The record `now` may be half written over the record `now - capacity`.

@@ -3,22 +3,22 @@
 
 use crate::atomic::{AtomicBool, Ordering};
 
-/// Whether a thread sleeps. Others put something where it looks, and then call it. A call costs a system call only if
+/// Whether a thread sleeps. Others put something into its rings, and then call it. A call costs a system call only if
 /// it sleeps.
 #[derive(Debug, Default)]
 pub struct SleepFlag(AtomicBool);
 
 impl SleepFlag {
-    /// Whether the thread has to be woken. Others ask this after they have put something where the thread looks.
+    /// Whether the thread has to be woken. Others ask this after they have put something into the thread's rings.
     pub fn is_to_be_woken(&self) -> bool {
         self.0.swap(false, Ordering::Release)
     }
 
-    /// The thread calls this before it sleeps. After this it must look once more.
+    /// The thread calls this before it sleeps. After this it must check its rings once more.
     ///
     /// Then no wake-up is lost. If this swap comes first, the swap in [`SleepFlag::is_to_be_woken`] finds the thread asleep.
-    /// Otherwise this swap reads the value that the other one left. So the look that follows sees all that was put there
-    /// before. A plain store would read nothing, and the second case would not hold. The thread could then look before
+    /// Otherwise this swap reads the value that the other one left. So the check that follows sees all that was put there
+    /// before. A plain store would read nothing, and the second case would not hold. The thread could then check before
     /// it can see what is there, and sleep although it was found awake.
     pub fn begin(&self) {
         self.0.swap(true, Ordering::Acquire);

@@ -2,7 +2,7 @@
 //! Words for a line with short pulses. One thread makes the pulses. If it is interrupted while the line is high, another
 //! one ends the pulse.
 //!
-//! The second thread may be interrupted, too: between a look at the line and the store that ends the pulse. A late store
+//! The second thread may be interrupted, too: between a read of the line and the store that ends the pulse. A late store
 //! must not cut a later pulse short. So each pulse has a number. The first thread makes a pulse when the second one has
 //! said that it watches this pulse. From then on the second one has no store for an earlier pulse in hand.
 
@@ -40,15 +40,15 @@ impl Watch {
         fence(Ordering::Release);
     }
 
-    /// The pulse that is announced; 0 without one. The second thread asks this before each look at the line.
+    /// The pulse that is announced; 0 without one. The second thread asks this before each read of the line.
     pub fn announced(&self) -> u32 {
-        // The look before comes first.
+        // The read before comes first.
         fence(Ordering::Acquire);
         self.announced.load(Ordering::Acquire)
     }
 
     /// The second thread watches this pulse from now on, and reports on the one before. It ends a pulse if two
-    /// of its looks after this call have found the line high.
+    /// of its reads after this call have found the line high.
     pub fn begin(&self, pulse: u32, known: u32) {
         self.known.store(known, Ordering::Relaxed);
         self.watched.store(pulse, Ordering::Release);

@@ -115,7 +115,7 @@ pub enum Event {
     },
     /// The recorder has looked at the kernel's accounts. It comes behind the events of what it saw.
     Looked {
-        /// It looks again within this time.
+        /// The next sample comes within this time.
         again: Ticks,
         /// Whether it looked at everything, and not only at the threads.
         all: bool,

@@ -45,7 +45,7 @@ pub enum End {
     },
     /// The program died. The guardian kept the recording.
     Died,
-    /// The core gave no sign of life. The guardian kept the recording, and killed the program.
+    /// The core had no heartbeat. The guardian kept the recording, and killed the program.
     Hung {
         /// The guardian's account of it.
         diagnosis: String,

@@ -225,7 +225,7 @@ impl<'a> History<'a> {
             }
             Event::Nak => "asked the host to send again what it had refused (NAK)".to_owned(),
             Event::Answered { id } => format!("answered {} without the core", self.command(id)),
-            Event::Alive => "the host's computer gave a sign of life".to_owned(),
+            Event::Alive => "the host's computer sent a keepalive".to_owned(),
             Event::Full => "the core has no room for the host's blocks".to_owned(),
             Event::JobBegan { oid, .. } => {
                 format!("works for {}. It did not end within {span} ms, when the recording ended", self.object(oid))

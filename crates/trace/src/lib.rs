@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The flight recorder's tapes: events, the rings that hold them, the file that they are kept in, and what they say.
+//! The flight recorder: events, the rings and the files that hold them, and their verdict and exports.
 //!
 //! - `event`: what is recorded, 16 bytes each
 //! - `ring`: the memory that a thread records into

@@ -154,7 +154,7 @@ pub(super) struct Fault {
 /// A board.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Board {
+pub(super) struct KnownBoard {
     pub(super) name: String,
     /// How the device tree's model begins.
     models: Vec<String>,
@@ -249,7 +249,7 @@ pub(super) struct Wire {
 /// All devices and boards.
 pub(super) struct Catalog {
     pub(super) devices: Vec<Device>,
-    boards: Vec<Board>,
+    boards: Vec<KnownBoard>,
 }
 
 impl Catalog {
@@ -277,7 +277,7 @@ impl Catalog {
     }
 
     /// The board that this computer is.
-    pub(super) fn board(&self, computer: &Computer) -> Option<&Board> {
+    pub(super) fn board(&self, computer: &Computer) -> Option<&KnownBoard> {
         let model = model(computer);
         self.boards.iter().find(|board| {
             let is_marked = board.marker.as_ref().is_none_or(|marker| {
@@ -300,7 +300,7 @@ pub(super) fn model(computer: &Computer) -> String {
     computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
 }
 
-impl Board {
+impl KnownBoard {
     /// Whether a device can be connected in this way.
     pub(super) fn has(&self, way: &Way) -> bool {
         let roles = way.wires.iter().filter(|(_, role)| role.starts_with("line")).count();
@@ -350,7 +350,7 @@ impl Board {
     ///
     /// # Errors
     ///
-    /// One line: no line is free, or the chosen pin is none for a line.
+    /// One line: no line is free, or the chosen pin has no line.
     pub(super) fn wires(
         &self,
         way: &Way,

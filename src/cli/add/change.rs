@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Changes of files: planned, shown, made, recorded and taken back.
 //!
-//! A file is replaced as a whole, by a rename: whoever kills the program leaves the old file or the new one. Files are
+//! A file is replaced as a whole, by a rename: a program that is killed leaves the old file or the new one. Files are
 //! reached below the descriptor of their folder ([`OwnFolder`]), never through a link in their place. What is printer.cfg's
 //! owner's is written with the rights of that user, so no file of anybody else can be behind it.
 //!
@@ -82,7 +82,7 @@ pub(super) struct Change {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Record {
     pub(super) changes: Vec<Change>,
-    /// The keys of all that it needs, whoever has made it.
+    /// The keys of all that it needs, also of earlier changes.
     pub(super) needs: Vec<String>,
 }
 

@@ -6,10 +6,10 @@
 use crate::cli::page::{Page, aligned};
 use pinion_linux::foreign::plain_xml;
 
-use super::catalog::{Board, Wire};
+use super::catalog::{KnownBoard, Wire};
 
 /// A table of the wires, and the header with them.
-pub(super) fn page(board: &Board, wires: &[Wire]) -> Page {
+pub(super) fn page(board: &KnownBoard, wires: &[Wire]) -> Page {
     let mut page = Page::default();
     let place = |pin: usize| match &board.connector {
         None => format!("pin {pin}"),
@@ -51,7 +51,7 @@ pub(super) fn page(board: &Board, wires: &[Wire]) -> Page {
 }
 
 /// The same as a picture.
-pub(super) fn svg(board: &Board, title: &str, wires: &[Wire]) -> String {
+pub(super) fn svg(board: &KnownBoard, title: &str, wires: &[Wire]) -> String {
     const ROW: usize = 22;
     const TOP: usize = 56;
     let columns = if board.connector.is_some() { 1 } else { 2 };

@@ -7,22 +7,22 @@
 #![forbid(unsafe_code)]
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use glob::Pattern;
+use pinion_printer_config::{Config, Files, Limit, Section, Setting, included};
 
 use crate::cli::computer::Computer;
 use crate::cli::doctor::host::klippys;
-use crate::cli::doctor::printer::{name_of, without_comment};
+use crate::cli::doctor::printer::{mcu_of, name_of, pins};
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::HOST_PATHS;
 
 use super::catalog::{Device, Kind};
 use super::change::{Change, Side, Splice};
 
-/// Highest number of files in a configuration. No configuration has as many.
-const FILES_MAX: usize = 500;
 /// Where klippy's configuration is if no klippy runs or is set up.
 const USUAL: [&str; 3] =
     ["/home/*/printer_data/config/printer.cfg", "/home/*/klipper_config/printer.cfg", "/home/*/printer.cfg"];
@@ -35,14 +35,6 @@ const MCU: &str = "mcu";
 /// How high above the bed resonances are measured, in millimeters (docs/Measuring_Resonances.md of Klipper).
 const PROBE_Z_MM: f64 = 20.0;
 
-/// A section of the configuration.
-#[derive(Debug, Default)]
-struct Section {
-    /// The files that it is in.
-    files: BTreeSet<PathBuf>,
-    values: BTreeMap<String, String>,
-}
-
 /// klippy's configuration.
 #[derive(Debug)]
 pub(super) struct Printer {
@@ -54,9 +46,29 @@ pub(super) struct Printer {
     pub(super) owner: (u32, u32),
     /// The contents of printer.cfg itself.
     text: String,
-    sections: BTreeMap<String, Section>,
-    /// The patterns of all includes in printer.cfg itself, as absolute paths.
-    includes: Vec<PathBuf>,
+    config: Config,
+}
+
+/// The files of a configuration, as far as they can be read: another user's do not count.
+struct Readable<'a> {
+    computer: &'a Computer,
+    /// printer.cfg and its contents.
+    main: (&'a Path, &'a str),
+}
+
+impl Files for Readable<'_> {
+    fn text(&self, path: &Path) -> io::Result<String> {
+        let (main, text) = self.main;
+        Ok(if path == main { text.to_owned() } else { Files::text(self.computer, path).unwrap_or_default() })
+    }
+
+    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
+        Files::matching(self.computer, pattern)
+    }
+
+    fn whole(&self, path: &Path) -> PathBuf {
+        self.computer.whole(path)
+    }
 }
 
 /// Finds printer.cfg: the one that is named, that of the only klippy, or the only one in a home folder.
@@ -122,7 +134,7 @@ impl Printer {
     ///
     /// # Errors
     ///
-    /// One line: printer.cfg itself cannot be read, or is a link.
+    /// One line: printer.cfg itself cannot be read, is a link, or has a line that klippy refuses.
     pub(super) fn read(computer: &Computer, path: &Path) -> Result<Printer, String> {
         Printer::read_as(computer, path, path)
     }
@@ -137,63 +149,17 @@ impl Printer {
         let owner = (about.uid(), about.gid());
         let side = Side { computer, owner: Some(owner), records: PathBuf::new() };
         let text = side.read(path)?.unwrap_or_default();
-        let mut printer = Printer {
-            path: named.to_owned(),
-            file: path.to_owned(),
-            owner,
-            text,
-            sections: BTreeMap::new(),
-            includes: Vec::new(),
-        };
-        let mut files = 0;
-        let text = printer.text.clone();
-        printer.take(computer, named, &text, &mut Vec::new(), &mut files);
-        Ok(printer)
-    }
-
-    fn take(&mut self, computer: &Computer, path: &Path, text: &str, within: &mut Vec<PathBuf>, files: &mut usize) {
-        *files += 1;
-        if *files > FILES_MAX || within.iter().any(|outer| outer == path) {
-            return;
-        }
-        within.push(path.to_owned());
-        let mut section = String::new();
-        for line in text.lines() {
-            let line = without_comment(line).trim_end();
-            if let Some(header) = line.strip_prefix('[').and_then(|line| line.split(']').next()) {
-                section = header.trim().to_owned();
-                if let Some(pattern) = section.strip_prefix("include ") {
-                    let pattern = path.parent().unwrap_or(Path::new("/")).join(pattern.trim());
-                    for file in computer.matching(&pattern) {
-                        let file = computer.name(&file);
-                        if let Some(text) = computer.text(&file) {
-                            self.take(computer, &file, &text, within, files);
-                        }
-                    }
-                    if within.len() == 1 {
-                        self.includes.push(pattern);
-                    }
-                } else {
-                    self.sections.entry(section.clone()).or_default().files.insert(path.to_owned());
-                }
-                continue;
-            }
-            let Some((key, value)) = line.split_once([':', '=']) else { continue };
-            if !key.starts_with(char::is_whitespace)
-                && let Some(section) = self.sections.get_mut(&section)
-            {
-                section.values.insert(key.trim_end().to_owned(), value.trim().to_owned());
-            }
-        }
-        within.pop();
+        let config = Config::read_from(&Readable { computer, main: (named, &text) }, named);
+        let config = config.map_err(|trouble| trouble.to_string())?;
+        Ok(Printer { path: named.to_owned(), file: path.to_owned(), owner, text, config })
     }
 
     /// The sections with a bus or a sensor of this computer that is not there, with its file.
     pub(super) fn absent(&self, computer: &Computer) -> Vec<(&str, Option<&str>, String)> {
-        let file = |(key, value): (&String, &String)| {
-            let name = name_of(value);
+        let file = |setting: &Setting| {
+            let name = name_of(&setting.value);
             let is_number = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || c == '.');
-            match (key.as_str(), name.strip_prefix("spidev"), name.strip_prefix("i2c.")) {
+            match (setting.key.as_str(), name.strip_prefix("spidev"), name.strip_prefix("i2c.")) {
                 ("spi_bus" | "pin", Some(number), _) if is_number(number) => Some(format!("/dev/{name}")),
                 ("i2c_bus", _, Some(number)) if is_number(number) => Some(format!("/dev/i2c-{number}")),
                 ("serial_no", ..) if name.chars().all(|c| c.is_ascii_hexdigit() || c == '-') => {
@@ -202,9 +168,9 @@ impl Printer {
                 _ => None,
             }
         };
-        let absent = self.sections.iter().filter_map(|(name, section)| {
-            let file = section.values.iter().find_map(file).filter(|file| !computer.path(file).exists())?;
-            Some((name.as_str(), section.values.get("sensor_type").map(String::as_str), file))
+        let absent = self.config.sections().iter().filter_map(|section| {
+            let file = section.settings().iter().find_map(file).filter(|file| !computer.path(file).exists())?;
+            Some((section.name.as_str(), section.text("sensor_type"), file))
         });
         absent.collect()
     }
@@ -222,77 +188,74 @@ impl Printer {
     /// A file other than the device's own that has this section.
     pub(super) fn elsewhere(&self, device: &Device) -> Option<&Path> {
         let own = self.file(device.name);
-        self.sections.get(&device.section)?.files.iter().find(|file| **file != own).map(PathBuf::as_path)
+        self.config.files_of(&device.section).find(|file| *file != own)
+    }
+
+    /// The sections that are not in the device's own file.
+    fn others(&self, device: &Device) -> impl Iterator<Item = &Section> {
+        let own = self.file(device.name);
+        let is_own = move |section: &Section| self.config.files_of(&section.name).any(|file| file == own);
+        self.config.sections().iter().filter(move |section| !is_own(section))
     }
 
     /// The pins of this computer that printer.cfg uses, without those of the device's own file.
     pub(super) fn taken(&self, device: &Device) -> BTreeSet<String> {
-        let own = self.file(device.name);
-        let mcus: BTreeSet<&str> = self.mcus().map(|(name, _)| name).collect();
-        let others = self.sections.values().filter(|section| !section.files.contains(&own));
-        let pins = others.flat_map(|section| &section.values).filter(|(key, _)| key.contains("pin"));
-        // Another MCU may have pins of the same names. A pin without a name in front is the main MCU's.
-        let mcu_of = |pin: &str| {
-            pin.trim_start_matches([' ', '!', '^', '~']).split_once(':').map_or("mcu", |(mcu, _)| mcu.trim()).to_owned()
-        };
-        let pins = pins.flat_map(|(_, pins)| pins.split(',')).filter(|pin| mcus.contains(mcu_of(pin).as_str()));
-        pins.map(|pin| name_of(pin).to_owned()).collect()
+        let mcus = self.mcus();
+        // Another MCU may have pins of the same names.
+        let is_own = |pin: &&str| mcu_of(pin).is_some_and(|mcu| mcus.contains_key(mcu.as_str()));
+        self.others(device).flat_map(pins).filter(is_own).map(|pin| name_of(pin).to_owned()).collect()
     }
 
     /// The section other than the device's own that uses this node of a bus.
     pub(super) fn user(&self, device: &Device, kind: Kind, node: &str) -> Option<String> {
-        let own = self.file(device.name);
         let name = node.replacen("i2c-", "i2c.", 1);
-        let is_it = |(key, value): (&String, &String)| {
-            let value = name_of(value);
+        let is_it = |setting: &Setting| {
+            let value = name_of(&setting.value);
             // The driver of an ADC takes the first chip select.
-            kind == Kind::W1 && key == "serial_no"
+            kind == Kind::W1 && setting.key == "serial_no"
                 || value == name
                 || value.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('/'))
                 || node == "spidev0.0" && value.starts_with("mcp3208/")
         };
-        let uses =
-            |(_, section): &(&String, &Section)| !section.files.contains(&own) && section.values.iter().any(is_it);
-        self.sections.iter().find(uses).map(|(section, _)| section.clone())
+        let mut others = self.others(device);
+        others.find(|section| section.settings().iter().any(is_it)).map(|section| section.name.clone())
     }
 
     /// The serial numbers that thermometers of printer.cfg have, without the device's own.
     pub(super) fn serials(&self, device: &Device) -> BTreeSet<&str> {
-        let own = self.file(device.name);
-        let others = self.sections.values().filter(|section| !section.files.contains(&own));
-        others.filter_map(|section| section.values.get("serial_no").map(String::as_str)).collect()
+        self.others(device).filter_map(|section| section.text("serial_no")).collect()
     }
 
     /// The MCUs of this computer, with their sections. The main one is called `mcu`.
-    fn mcus(&self) -> impl Iterator<Item = (&str, &Section)> {
-        self.sections.iter().filter_map(|(name, section)| {
-            let name = if name == "mcu" { name.as_str() } else { name.strip_prefix("mcu ")?.trim() };
-            let is_own = section.values.get("serial").is_some_and(|serial| serial.starts_with(HOST_PATHS));
-            is_own.then_some((name, section))
-        })
+    fn mcus(&self) -> BTreeMap<&str, &Section> {
+        let own = self.config.of_kind("mcu").filter_map(|section| {
+            section.text("serial").filter(|serial| serial.starts_with(HOST_PATHS))?;
+            Some((section.name.strip_prefix("mcu ").map_or("mcu", str::trim), section))
+        });
+        own.collect()
     }
 
     /// The name of this computer's MCU, and whether it has to be added.
     pub(super) fn mcu(&self) -> (String, bool) {
-        self.mcus().next().map_or(("host".into(), true), |(name, _)| (name.to_owned(), false))
+        self.mcus().keys().next().map_or(("host".into(), true), |name| ((*name).to_owned(), false))
     }
 
     /// The link by which klippy finds this computer's MCU.
     pub(super) fn link(&self) -> &Path {
-        let serial = self.mcus().find_map(|(_, section)| section.values.get("serial"));
+        let serial = self.mcus().values().find_map(|section| section.text("serial"));
         serial.map_or(Path::new(LINK), Path::new)
     }
 
     /// The middle of the bed.
     fn probe_point(&self) -> Option<String> {
-        let number = |section: &str, key: &str| self.sections.get(section)?.values.get(key)?.parse::<f64>().ok();
+        let number = |section: &str, key: &str| self.config.section(section)?.number(key, Limit::Any).ok()?;
         let middle = |axis: &str| {
             let section = format!("stepper_{axis}");
             let (from, to) = (number(&section, "position_min").unwrap_or(0.0), number(&section, "position_max")?);
             // A negative minimum is beside the bed.
             Some((from.max(0.0) + to) / 2.0)
         };
-        if self.sections.contains_key("stepper_a") {
+        if self.config.section("stepper_a").is_some() {
             // The middle of a delta printer is its origin.
             return Some(format!("0, 0, {PROBE_Z_MM}"));
         }
@@ -328,7 +291,7 @@ impl Printer {
         }
         needs.push(MCU.to_owned());
         let mut text = format!("# Written by pinion add {}. {}\n{}", device.name, device.title, sections.trim_start());
-        if device.resonance && !self.is_in_others("resonance_tester", device) {
+        if device.resonance && !self.others(device).any(|section| section.name == "resonance_tester") {
             text += &match self.probe_point() {
                 Some(point) => format!(
                     "\n[resonance_tester]\naccel_chip: {}\n# The middle of the bed, and {PROBE_Z_MM} mm above it\nprobe_points: {point}\n",
@@ -340,7 +303,8 @@ impl Printer {
         }
         make(device.name, self.file(device.name), text)?;
         let folder = self.folder();
-        let is_included = self.includes.iter().any(|pattern| {
+        let includes = self.text.lines().filter_map(included);
+        let is_included = includes.map(|pattern| self.path.with_file_name(pattern)).any(|pattern| {
             let pattern = pattern.to_str().and_then(|pattern| Pattern::new(pattern).ok());
             pattern.is_some_and(|pattern| pattern.matches_path(&folder.join("any-name.cfg")))
         });
@@ -348,11 +312,6 @@ impl Printer {
             changes.push(Change { key: INCLUDE.into(), file: self.file.clone(), makes: false, splice: self.include() });
         }
         Ok((changes, needs))
-    }
-
-    fn is_in_others(&self, section: &str, device: &Device) -> bool {
-        let own = self.file(device.name);
-        self.sections.get(section).is_some_and(|section| section.files.iter().any(|file| *file != own))
     }
 
     /// The include, behind the last one at the top of printer.cfg, or at its head. No option can stand behind an
@@ -363,7 +322,7 @@ impl Printer {
         let mut place = 0;
         for line in self.text.split_inclusive('\n') {
             at += line.len();
-            if line.starts_with("[include ") {
+            if included(line).is_some() {
                 place = at;
             }
         }
@@ -498,7 +457,7 @@ mod tests {
         let file = "/home/pi/dotfiles/printer.cfg";
         assert!(error.ends_with(&format!("--config {file}")), "{error}");
         let printer = Printer::find(&tree.computer(), Some(Path::new(file))).unwrap();
-        assert!(printer.sections.contains_key("adxl345"), "{printer:?}");
+        assert!(printer.config.section("adxl345").is_some(), "{printer:?}");
         let computer = tree.computer();
         let side = Side { computer: &computer, owner: None, records: printer.folder() };
         let catalog = Catalog::read().unwrap();
@@ -520,8 +479,14 @@ mod tests {
         let error = Printer::read(&tree.computer(), Path::new("/home/c/printer.cfg")).unwrap_err();
         assert!(error.ends_with("it is a link: name the file that it leads to: --config /etc/shadow"), "{error}");
         // A file that includes itself, or everything.
-        tree.put("home/a/printer_data/config/printer.cfg", "[include *.cfg]\n[include /*/*]\n[fan]\npin: a\n");
         let path = Path::new("/home/a/printer_data/config/printer.cfg");
-        assert!(Printer::read(&tree.computer(), path).unwrap().sections.contains_key("fan"));
+        for (text, refusal) in [
+            ("[include *.cfg]\n", "printer.cfg:1: Recursive include of config file"),
+            ("[include /*/*]\n", "/etc/shadow:1: File contains no section headers."),
+        ] {
+            tree.put("home/a/printer_data/config/printer.cfg", text);
+            let error = Printer::read(&tree.computer(), path).unwrap_err();
+            assert!(error.contains(refusal), "{error}");
+        }
     }
 }

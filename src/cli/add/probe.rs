@@ -22,7 +22,7 @@ const SPI_READ: u8 = 0x80;
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Answer {
     /// In words, for a reader.
-    pub(super) told: String,
+    pub(super) text: String,
     /// The I2C address that it has.
     pub(super) address: Option<u8>,
 }
@@ -84,7 +84,7 @@ impl Buses for Live {
 /// One line: what it has answered, what that means, and what to do.
 pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result<Answer, String> {
     let Some(check) = &way.check else {
-        return Ok(Answer { told: "it cannot be asked: try it out".into(), address: None });
+        return Ok(Answer { text: "it cannot be asked: try it out".into(), address: None });
     };
     if way.addresses.is_empty() {
         let mut device = buses.spi(way)?;
@@ -94,13 +94,13 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
                 // A chip that speaks I2C until the first edge of its chip select answers nothing here.
                 read()?;
                 let answers = (0..READS).map(|_| read()).collect::<Result<Vec<u8>, String>>()?;
-                judge(catalog, Kind::Spi, *register, ids, &answers).map(|told| Answer { told, address: None })
+                judge(catalog, Kind::Spi, *register, ids, &answers).map(|text| Answer { text, address: None })
             }
             Check::Fixed { register, mask, bits, faults } => {
                 let answer = exchange(&mut *device, *register, mask.len())?;
-                fixed(&answer, mask, bits, faults).map(|told| Answer { told, address: None })
+                fixed(&answer, mask, bits, faults).map(|text| Answer { text, address: None })
             }
-            _ => Ok(Answer { told: "it cannot be asked over SPI: try it out".into(), address: None }),
+            _ => Ok(Answer { text: "it cannot be asked over SPI: try it out".into(), address: None }),
         };
     }
     let mut others = Vec::new();
@@ -108,8 +108,8 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
     for address in &way.addresses {
         let mut device = buses.i2c(*address)?;
         match asked(catalog, check, &mut *device) {
-            Ok(told) => {
-                return Ok(Answer { told: format!("{told} at address {address:#04x}"), address: Some(*address) });
+            Ok(text) => {
+                return Ok(Answer { text: format!("{text} at address {address:#04x}"), address: Some(*address) });
             }
             Err(Failure::Nobody) => {}
             Err(Failure::Bus(why)) => return Err(why),
@@ -208,14 +208,14 @@ fn judge(catalog: &Catalog, bus: Kind, register: u8, ids: &[u8], answers: &[u8])
         return Err(why);
     }
     let wanted = ids.first().copied().unwrap_or_default();
-    let told = format!("its id is {first:#04x} instead of {wanted:#04x}");
+    let text = format!("its id is {first:#04x} instead of {wanted:#04x}");
     let is_shifted = ids.iter().any(|id| [id >> 1, id >> 1 | 0x80, id << 1, id << 1 | 1].contains(&first));
     if is_shifted {
-        return Err(format!("{told}, shifted by a bit: shorten the wires, twist SCLK and CS each with ground"));
+        return Err(format!("{text}, shifted by a bit: shorten the wires, twist SCLK and CS each with ground"));
     }
     match catalog.with_id(register, first) {
-        Some(other) => Err(format!("{told}, that of another chip: pinion add {}", other.name)),
-        None => Err(format!("{told}: it is another chip, or data wires are swapped")),
+        Some(other) => Err(format!("{text}, that of another chip: pinion add {}", other.name)),
+        None => Err(format!("{text}: it is another chip, or data wires are swapped")),
     }
 }
 
@@ -224,13 +224,13 @@ fn fixed(answer: &[u8], mask: &[u8], bits: &[u8], faults: &[Fault]) -> Result<St
     if let Some(why) = silence(Kind::Spi, answer) {
         return Err(why);
     }
-    let told = format!("it answers {}", hex(answer));
+    let text = format!("it answers {}", hex(answer));
     if answer.iter().zip(mask).zip(bits).any(|((answer, mask), bits)| answer & mask != *bits) {
-        return Err(format!("{told}, as this chip never does: it is another chip, or data wires are swapped"));
+        return Err(format!("{text}, as this chip never does: it is another chip, or data wires are swapped"));
     }
     match faults.iter().find(|fault| answer.get(fault.byte).is_some_and(|byte| byte & fault.bit != 0)) {
-        Some(fault) => Err(format!("{told}: {}", fault.meaning)),
-        None => Ok(told),
+        Some(fault) => Err(format!("{text}: {}", fault.meaning)),
+        None => Ok(text),
     }
 }
 
@@ -320,7 +320,7 @@ mod tests {
         }
     }
 
-    fn told(device: &str, way: usize, chips: &[(u8, &[u8])]) -> Result<Answer, String> {
+    fn asked(device: &str, way: usize, chips: &[(u8, &[u8])]) -> Result<Answer, String> {
         let catalog = Catalog::read().unwrap();
         let way = &catalog.device(device).unwrap().way[way];
         let mut chips = Chips(chips.iter().map(|(address, bytes)| (*address, bytes.to_vec())).collect());
@@ -339,15 +339,15 @@ mod tests {
             (0xea, Some("that of another chip: pinion add icm20948")),
             (0x42, Some("it is another chip")),
         ] {
-            let result = told("adxl345", 0, &[(0, &[answer])]);
+            let result = asked("adxl345", 0, &[(0, &[answer])]);
             match words {
-                None => assert_eq!(result.unwrap().told, "its id is 0xe5"),
+                None => assert_eq!(result.unwrap().text, "its id is 0xe5"),
                 Some(words) => assert!(result.as_ref().unwrap_err().contains(words), "{result:?}"),
             }
         }
-        let noise = told("adxl345", 0, &[(0, &[0xe5, 0x12, 0xe5, 0xff])]).unwrap_err();
+        let noise = asked("adxl345", 0, &[(0, &[0xe5, 0x12, 0xe5, 0xff])]).unwrap_err();
         assert!(noise.starts_with("its id changes from read to read (12 e5 ff"), "{noise}");
-        assert_eq!(told("lis2dw", 0, &[(0, &[0x33])]).unwrap_err().rsplit_once(": ").unwrap().1, "pinion add lis3dh");
+        assert_eq!(asked("lis2dw", 0, &[(0, &[0x33])]).unwrap_err().rsplit_once(": ").unwrap().1, "pinion add lis3dh");
     }
 
     #[test]
@@ -370,10 +370,10 @@ mod tests {
             ("max31865", &[0xff, 0xff, 0x00, 0x00], Ok("it answers ff ff 00 00")),
             ("max31865", &[0x7f, 0xff, 0x80, 0x00], Err("as this chip never does")),
         ] {
-            let result = told(device, 0, &[(0, answer)]);
-            let result = result.as_ref().map(|answer| &*answer.told).map_err(|why| &**why);
+            let result = asked(device, 0, &[(0, answer)]);
+            let result = result.as_ref().map(|answer| &*answer.text).map_err(|why| &**why);
             match (result, words) {
-                (Ok(told), Ok(words)) | (Err(told), Err(words)) => assert!(told.contains(words), "{device}: {told}"),
+                (Ok(text), Ok(words)) | (Err(text), Err(words)) => assert!(text.contains(words), "{device}: {text}"),
                 _ => panic!("{device} {answer:x?}: {result:?}"),
             }
         }
@@ -381,27 +381,30 @@ mod tests {
 
     #[test]
     fn a_chip_is_found_at_its_other_address() {
-        let answer = told("bme280", 0, &[(0x77, &[0x60])]).unwrap();
-        assert_eq!((answer.address, &*answer.told), (Some(0x77), "its id is 0x60 at address 0x77"));
-        assert_eq!(told("bme280", 0, &[(0x76, &[0x58]), (0x77, &[0x60])]).unwrap().address, Some(0x76));
+        let answer = asked("bme280", 0, &[(0x77, &[0x60])]).unwrap();
+        assert_eq!((answer.address, &*answer.text), (Some(0x77), "its id is 0x60 at address 0x77"));
+        assert_eq!(asked("bme280", 0, &[(0x76, &[0x58]), (0x77, &[0x60])]).unwrap().address, Some(0x76));
         // A stranger at the first address does not hide the chip at the second.
-        assert_eq!(told("bme280", 0, &[(0x76, &[0x12]), (0x77, &[0x60])]).unwrap().address, Some(0x77));
-        let error = told("bme280", 0, &[]).unwrap_err();
+        assert_eq!(asked("bme280", 0, &[(0x76, &[0x12]), (0x77, &[0x60])]).unwrap().address, Some(0x77));
+        let error = asked("bme280", 0, &[]).unwrap_err();
         assert!(error.starts_with("nobody answers at 0x76 or 0x77: check power"), "{error}");
-        let error = told("mpu9250", 0, &[(0x69, &[0x19])]).unwrap_err();
+        let error = asked("mpu9250", 0, &[(0x69, &[0x19])]).unwrap_err();
         assert!(error.starts_with("at address 0x69: its id is 0x19 instead of 0x74"), "{error}");
-        assert_eq!(told("ssd1306", 0, &[(0x3d, &[0])]).unwrap().address, Some(0x3d));
+        assert_eq!(asked("ssd1306", 0, &[(0x3d, &[0])]).unwrap().address, Some(0x3d));
     }
 
     #[test]
     fn a_temperature_and_a_crc_are_checked() {
-        assert_eq!(told("lm75", 0, &[(0x48, &[0x19, 0x80])]).unwrap().told, "it measures 25.5 degrees at address 0x48");
-        assert_eq!(told("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().told, "it measures -10.0 degrees at address 0x4f");
-        assert!(told("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is no temperature"));
+        assert_eq!(
+            asked("lm75", 0, &[(0x48, &[0x19, 0x80])]).unwrap().text,
+            "it measures 25.5 degrees at address 0x48"
+        );
+        assert_eq!(asked("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().text, "it measures -10.0 degrees at address 0x4f");
+        assert!(asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is no temperature"));
         // The example of the SHT3x's data sheet.
         assert_eq!(crc8(&[0xbe, 0xef]), 0x92);
-        assert!(told("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
-        assert!(told("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
+        assert!(asked("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
+        assert!(asked("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
     }
 
     /// Wrong answers of every chip that can be asked.
@@ -437,13 +440,13 @@ mod tests {
                 for (what, answer) in answers {
                     let addresses = way.addresses.iter().copied().chain([0]);
                     let mut chips = Chips(addresses.map(|address| (address, answer.clone())).collect());
-                    let told = ask(&catalog, way, &mut chips);
-                    assert!(told.is_err(), "{} by {:?}, {what} {answer:x?}: {told:?}", device.name, way.bus);
+                    let text = ask(&catalog, way, &mut chips);
+                    assert!(text.is_err(), "{} by {:?}, {what} {answer:x?}: {text:?}", device.name, way.bus);
                     asked += 1;
                 }
                 if !way.addresses.is_empty() {
-                    let told = ask(&catalog, way, &mut Chips::default()).unwrap_err();
-                    assert!(told.starts_with("nobody answers at 0x"), "{}: {told}", device.name);
+                    let text = ask(&catalog, way, &mut Chips::default()).unwrap_err();
+                    assert!(text.starts_with("nobody answers at 0x"), "{}: {text}", device.name);
                 }
             }
         }
@@ -479,11 +482,11 @@ mod tests {
         let config = SimConfig::parse(&described, "this test").unwrap();
         let mut chips = Simulated(SimBoard::new(config, Arc::new(Monotonic::start())).unwrap());
         let catalog = Catalog::read().unwrap();
-        let mut told = |device: &str| ask(&catalog, &catalog.device(device).unwrap().way[0], &mut chips);
-        assert_eq!(told("adxl345").unwrap().told, "its id is 0xe5");
-        assert!(told("lis2dw").is_err());
-        assert_eq!(told("ssd1306").unwrap().address, Some(0x3c));
-        assert!(told("bme280").unwrap_err().starts_with("nobody answers at 0x76 or 0x77"));
+        let mut asked = |device: &str| ask(&catalog, &catalog.device(device).unwrap().way[0], &mut chips);
+        assert_eq!(asked("adxl345").unwrap().text, "its id is 0xe5");
+        assert!(asked("lis2dw").is_err());
+        assert_eq!(asked("ssd1306").unwrap().address, Some(0x3c));
+        assert!(asked("bme280").unwrap_err().starts_with("nobody answers at 0x76 or 0x77"));
     }
 
     proptest! {

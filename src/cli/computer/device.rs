@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Devices by the names that a host or a link gives them.
 //!
-//! A name may be anything: a configuration, a link in /tmp or a false host chose it. A finding tells its reader whom to
-//! let at the file behind the name. So a name counts only if it means a device of the expected kind.
+//! A name may be anything: a configuration, a link in /tmp or a false host chose it. A finding says who may
+//! get access to the file behind the name. So a name counts only if it means a device of the expected kind.
 
 #![forbid(unsafe_code)]
 

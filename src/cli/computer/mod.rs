@@ -17,6 +17,7 @@ use glob::{MatchOptions, Pattern};
 use nix::unistd::{User, getegid, geteuid, getgroups, getuid};
 
 use pinion_linux::foreign;
+use pinion_printer_config::{Disk, Files};
 use pinion_runtime::klippy::process::Ids;
 
 pub(super) mod device;
@@ -226,6 +227,22 @@ impl Computer {
         let groups = getgroups().unwrap_or_default();
         let gids = std::iter::once(getegid()).chain(groups).map(nix::unistd::Gid::as_raw).collect();
         Some(Who { name, uid: uid.as_raw(), gids })
+    }
+}
+
+/// The computer's configurations of klippy. A link leads where it leads on that computer.
+impl Files for Computer {
+    fn text(&self, path: &Path) -> io::Result<String> {
+        let file = self.follow(path)?.pop().ok_or(io::ErrorKind::NotFound)?;
+        Ok(String::from_utf8_lossy(&foreign::read(&file, TEXT_MAX)?).into_owned())
+    }
+
+    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
+        Ok(Computer::matching(self, pattern).iter().map(|file| self.name(file)).collect())
+    }
+
+    fn whole(&self, path: &Path) -> PathBuf {
+        Disk.whole(path)
     }
 }
 

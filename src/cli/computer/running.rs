@@ -98,7 +98,7 @@ impl Computer {
         processes
     }
 
-    /// Whether a process is called like a Pinion that serves hosts, and is none of its helpers.
+    /// Whether a process has the name of a Pinion that serves hosts, and not that of a helper.
     fn is_pinion(&self, process: &Process) -> bool {
         let is_helper = |name: String| helpers::NAMES.iter().any(|helper| name.as_bytes() == helper.to_bytes());
         process.is_pinion()
@@ -209,7 +209,7 @@ pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
             Ok(Search::Hidden(klippys)) => (klippys.into_iter().next()?, "may be"),
             Err(error) => {
                 return Some(format!(
-                    "whether a host is attached to {who} cannot be told: {}: {error}: stop this Pinion, or try with sudo",
+                    "whether a host is attached to {who} is unknown: {}: {error}: stop this Pinion, or try with sudo",
                     link.display()
                 ));
             }

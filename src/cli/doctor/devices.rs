@@ -171,7 +171,7 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
 
 /// `None` if there is nothing to open. `anew` is the remedy that makes the user's new groups count.
 fn permission(computer: &Computer, user: &Who, anew: &str, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
-    // A node that vanishes meanwhile does not count.
+    // A node that vanishes before it is read does not count.
     let nodes: Vec<_> = nodes.iter().filter_map(|node| Some((node, fs::metadata(node).ok()?))).collect();
     let refused: Vec<_> = nodes.iter().filter(|(_, about)| !user.may(class.access, about)).collect();
     let (name, who) = (class.name, &user.name);
@@ -460,7 +460,10 @@ mod tests {
         assert!(told(&presence(&tree.computer()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
         let findings = presence(&tree.computer());
-        assert!(findings.iter().all(|finding| finding.status == Fine && finding.told.remedy.is_none()), "{findings:?}");
+        assert!(
+            findings.iter().all(|finding| finding.status == Fine && finding.trouble.remedy.is_none()),
+            "{findings:?}"
+        );
         told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
     }
 

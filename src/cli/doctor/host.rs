@@ -187,15 +187,16 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));
     let host = format!("the host is klippy of {}{commit} ({found_by})", shown.display());
     let serves = |instance: &&Instance| instance.link.as_ref().is_some_and(|link| klippy.opens(link));
-    let told = instances.iter().filter(serves).filter_map(|instance| Some((instance, instance.settings.dialect?)));
-    let told: Vec<(&Instance, DialectName)> = told.collect();
-    let wrong = told.iter().find(|(_, name)| *name != best.dialect);
-    let mut findings = vec![match (wrong, told.is_empty()) {
+    let configured =
+        instances.iter().filter(serves).filter_map(|instance| Some((instance, instance.settings.dialect?)));
+    let configured: Vec<(&Instance, DialectName)> = configured.collect();
+    let wrong = configured.iter().find(|(_, name)| *name != best.dialect);
+    let mut findings = vec![match (wrong, configured.is_empty()) {
         (None, true) => Finding::ok(DIALECT, format!("{host}: it is served in the dialect {}", best.dialect)),
-        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as Pinion is told", best.dialect)),
+        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as configured", best.dialect)),
         (Some((instance, name)), _) => Finding::warning(
             DIALECT,
-            format!("{host}: its dialect is {}, and Pinion is told to speak {name}", best.dialect),
+            format!("{host}: its dialect is {}, and Pinion's configuration says {name}", best.dialect),
             format!("dialect = \"auto\" in {}, then {}", instance.config(), instance.restart()),
         ),
     }];
@@ -284,9 +285,9 @@ mod tests {
         told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
         let speak = |name: &str| tree.put("etc/pinion/pinion.toml", format!("dialect = \"{name}\"\n"));
         speak("v0.12");
-        told(&look(), "dialect", Ok, "as Pinion is told");
+        told(&look(), "dialect", Ok, "as configured");
         speak("kalico");
-        told(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion is told to speak kalico");
+        told(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion's configuration says kalico");
         // This klippy is another instance's host.
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
         told(&look(), "dialect", Ok, "it is served in the dialect v0.12");

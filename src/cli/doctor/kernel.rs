@@ -74,21 +74,21 @@ fn throttle(computer: &Computer) -> Finding {
     let number =
         |name: &str| -> Option<i64> { computer.text(format!("/proc/sys/kernel/sched_rt_{name}_us"))?.parse().ok() };
     let (Some(runtime), Some(period)) = (number("runtime"), number("period")) else {
-        return Finding::ok(CHECK, "whether the kernel throttles real time is unknown: it does not tell");
+        return Finding::ok(CHECK, "the kernel does not say if it throttles real time");
     };
-    let told = format!("real time may take {runtime} of {period} us");
+    let found = format!("real time may take {runtime} of {period} us");
     match runtime {
         -1 => Finding::ok(CHECK, "the kernel does not throttle real time"),
         0 => Finding::error(CHECK, "the kernel permits no real time: kernel.sched_rt_runtime_us is 0", REMEDY),
-        runtime if runtime < period / 2 => Finding::warning(CHECK, told, REMEDY),
-        _ => Finding::ok(CHECK, format!("{told}: Pinion stays clear of it")),
+        runtime if runtime < period / 2 => Finding::warning(CHECK, found, REMEDY),
+        _ => Finding::ok(CHECK, format!("{found}: Pinion stays clear of it")),
     }
 }
 
 fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "isolated_cpus";
     let Some(isolated) = computer.text("/sys/devices/system/cpu/isolated") else {
-        return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
+        return vec![Finding::ok(CHECK, "the kernel does not say which processors are isolated")];
     };
     // If it is unknown, any processor may be there.
     let present = computer.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
@@ -132,7 +132,7 @@ fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
             "" => Finding::ok(CHECK, "no processor is isolated, and Pinion takes any"),
             isolated => Finding::warning(
                 CHECK,
-                format!("isolated: {isolated}, which nobody uses: Pinion is not told to"),
+                format!("isolated: {isolated}, which nobody uses: Pinion is not configured to"),
                 format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
             ),
         });
@@ -279,7 +279,7 @@ mod tests {
         let findings = found(&Tree::new(), None);
         assert_eq!(findings.len(), 4);
         assert!(
-            findings.iter().all(|finding| finding.status == Ok && finding.told.found().contains("unknown")),
+            findings.iter().all(|finding| finding.status == Ok && finding.trouble.found().contains("unknown")),
             "{findings:?}"
         );
     }

@@ -10,7 +10,7 @@ use crate::cli::finding::Finding;
 use crate::cli::page::Page;
 use pinion_firmware::feature::FEATURES;
 use pinion_runtime::klippy::sources::Shape;
-use pinion_runtime::klippy::{Checkout, Verdict};
+use pinion_runtime::klippy::{Checkout, DialectFit};
 
 use super::UPGRADE;
 
@@ -51,24 +51,24 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
         all.len()
     ));
     page.line("");
-    for verdict in &checkout.verdicts {
-        let mark = if verdict.dialect == best.dialect { "  <- the one that it is served" } else { "" };
-        page.line(format_args!("  {:<8}{:>4}{mark}", verdict.dialect.name(), verdict.served.len()));
+    for fit in &checkout.fits {
+        let mark = if fit.dialect == best.dialect { "  <- the one that it is served" } else { "" };
+        page.line(format_args!("  {:<8}{:>4}{mark}", fit.dialect.name(), fit.served.len()));
     }
     if let Some(unread) = &checkout.unread {
         page.line("");
         page.line(format_args!("Not all of it can be read, and what is left out here does not count: {unread}"));
     }
     let differing: Vec<&Shape> =
-        all.into_iter().filter(|shape| checkout.verdicts.iter().any(|verdict| verdict.other.contains(shape))).collect();
+        all.into_iter().filter(|shape| checkout.fits.iter().any(|fit| fit.other.contains(shape))).collect();
     if !differing.is_empty() {
-        let columns = |of: &dyn Fn(&Verdict) -> &'static str| -> String {
-            checkout.verdicts.iter().map(|verdict| format!("{:<8}", of(verdict))).collect()
+        let columns = |of: &dyn Fn(&DialectFit) -> &'static str| -> String {
+            checkout.fits.iter().map(|fit| format!("{:<8}", of(fit))).collect()
         };
         page.append(&Page::text("\nNot every dialect has these forms:\n\n"));
-        page.line(format_args!("  {}", columns(&|verdict| verdict.dialect.name())));
+        page.line(format_args!("  {}", columns(&|fit| fit.dialect.name())));
         for shape in differing {
-            let has = columns(&|verdict| if verdict.served.contains(shape) { "yes" } else { "-" });
+            let has = columns(&|fit| if fit.served.contains(shape) { "yes" } else { "-" });
             page.line(format_args!("  {has}{}", shape.as_str()));
         }
     }

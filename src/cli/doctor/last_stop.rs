@@ -77,7 +77,7 @@ mod tests {
         };
         let mut newest = Trace { head, threads: Vec::new() };
         let ended = UNIX_EPOCH + Duration::from_millis(newest.head.utc_ms);
-        assert_eq!(finding(ended).told.found(), "no stop of the MCU is recorded");
+        assert_eq!(finding(ended).trouble.found(), "no stop of the MCU is recorded");
         let path = tree.computer().path("/var/lib/pinion/mcu-20261122T142614.000Z.trace");
         let put = |trace: &Trace| {
             let mut file = Vec::new();
@@ -89,20 +89,23 @@ mod tests {
         let found = finding(ended + hour);
         assert_eq!(found.status, Level::Warning);
         assert!(
-            found.told.found().ends_with(
+            found.trouble.found().ends_with(
                 " UTC: Pinion died: look for a panic in its log, and for who killed it (dmesg: out of memory)"
             ),
             "{found:?}"
         );
-        assert_eq!(found.told.remedy.as_deref(), Some("pinion trace /var/lib/pinion/mcu-20261122T142614.000Z.trace"));
+        assert_eq!(
+            found.trouble.remedy.as_deref(),
+            Some("pinion trace /var/lib/pinion/mcu-20261122T142614.000Z.trace")
+        );
         assert_eq!(finding(ended + 8 * 24 * hour).status, Level::Ok, "it is old");
         newest.head.end = End::Shutdown { reason: "Command request".into(), trouble: "the host asked for it".into() };
         put(&newest);
         let found = finding(ended + hour);
         assert_eq!(found.status, Level::Ok);
-        assert!(found.told.found().contains("nobody was late: the host asked for it"), "{found:?}");
+        assert!(found.trouble.found().contains("nobody was late: the host asked for it"), "{found:?}");
         // A newer file, which cannot be read.
         tree.put("var/lib/pinion/mcu-20261123T142614.000Z.trace", "x");
-        assert!(finding(ended).told.found().contains("unknown: "));
+        assert!(finding(ended).trouble.found().contains("unknown: "));
     }
 }

@@ -127,13 +127,13 @@ mod tests {
     use super::super::instance::instances;
     use super::super::tests::told;
     use super::*;
-    use crate::cli::boards::{self, Board};
+    use crate::cli::boards::{self, TestBoard};
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Ok as Fine, Warning};
     use pinion_linux::gpio::LineInfo;
 
     /// The findings about the header of a board, with these pins in printer.cfg.
-    fn about_header(board: &Board, pins: &[&str]) -> Vec<Finding> {
+    fn about_header(board: &TestBoard, pins: &[&str]) -> Vec<Finding> {
         let tree = board.tree();
         header(&tree.computer(), &board.inventory(&tree), &pins.iter().copied().collect())
     }
@@ -151,7 +151,7 @@ mod tests {
         assert_eq!(remedy, "in printer.cfg write GPIO17 for gpio17, pinctrl-rp1/gpio33 for gpiochip4/gpio33");
         for pins in [&[][..], &["gpiochip15/gpio17"], &["gpiochip11/gpio1"], &["gpio99"]] {
             let findings = about_header(&boards::pi5(), pins);
-            assert!(findings.len() == 1 && findings[0].told.remedy.is_none(), "{findings:?}");
+            assert!(findings.len() == 1 && findings[0].trouble.remedy.is_none(), "{findings:?}");
             told(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
         }
         // gpio17 is a line of the processor's own chip there.

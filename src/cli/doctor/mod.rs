@@ -13,7 +13,7 @@ use std::time::SystemTime;
 use clap::{Args, ValueHint};
 
 use pinion_linux::Inventory;
-use pinion_runtime::latency::{self, Fitness, Verdict};
+use pinion_runtime::latency::{self, Assessment, Fitness};
 
 use super::add;
 use super::computer::Computer;
@@ -135,11 +135,11 @@ fn examine(computer: &Computer) -> Vec<Group> {
 }
 
 /// A sample of two seconds proves nothing, so its result is no error.
-fn latency(sample: Result<Verdict, String>) -> Finding {
+fn latency(sample: Result<Assessment, String>) -> Finding {
     const CHECK: &str = "latency";
     match sample {
         Err(error) => Finding::warning(CHECK, format!("the latency is unknown: {error}"), "pinion latency"),
-        Ok(Verdict { fitness, why, remedy }) => {
+        Ok(Assessment { fitness, why, remedy }) => {
             let found = format!("{fitness}: {why} (in two seconds; pinion latency measures for longer)");
             match (fitness, remedy) {
                 (Fitness::Steppers, None) => Finding::ok(CHECK, found),
@@ -160,11 +160,11 @@ mod tests {
     #[track_caller]
     pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
-            finding.check == check && finding.status == status && finding.told.found().contains(words)
+            finding.check == check && finding.status == status && finding.trouble.found().contains(words)
         };
         let found = findings.iter().find(is_it);
         assert!(found.is_some(), "no {status:?} of {check} with \"{words}\" in {findings:#?}");
-        found.and_then(|finding| finding.told.remedy.clone()).unwrap_or_default().into()
+        found.and_then(|finding| finding.trouble.remedy.clone()).unwrap_or_default().into()
     }
 
     #[test]
@@ -253,11 +253,11 @@ mod tests {
     #[test]
     fn a_sample_is_no_error() {
         let verdict = |fitness, remedy: Option<&str>| {
-            latency(Ok(Verdict { fitness, why: "x".into(), remedy: remedy.map(str::to_owned) }))
+            latency(Ok(Assessment { fitness, why: "x".into(), remedy: remedy.map(str::to_owned) }))
         };
         assert_eq!(verdict(Fitness::Steppers, None).status, Level::Ok);
         assert_eq!(verdict(Fitness::Steppers, Some("run it as root")).status, Level::Warning);
-        assert_eq!(verdict(Fitness::Nothing, Some("isolate")).told.remedy.as_deref(), Some("isolate"));
+        assert_eq!(verdict(Fitness::Nothing, Some("isolate")).trouble.remedy.as_deref(), Some("isolate"));
         assert_eq!(latency(Err("no thread".into())).status, Level::Warning);
     }
 }

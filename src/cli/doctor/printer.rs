@@ -3,13 +3,13 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use crate::cli::computer::Computer;
+use pinion_printer_config::pins::{MAIN, Pin};
+use pinion_printer_config::{Config, Section};
 
-/// Highest number of files in a configuration. No configuration has as many.
-const FILES_MAX: usize = 500;
+use crate::cli::computer::Computer;
 
 /// The parts of a configuration that count here.
 #[derive(Debug, PartialEq)]
@@ -27,40 +27,46 @@ pub(super) struct Printer {
     pub(super) numbered: BTreeSet<(PathBuf, String)>,
 }
 
-/// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
-/// klippy/configfile.py the last entry of a section counts.
+/// Reads a configuration, with the files that it includes. `None` if one of them cannot be read, or if klippy would
+/// refuse one.
 pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
-    let mut reader = Reader {
-        computer,
-        serials: BTreeMap::new(),
-        led_pins: BTreeMap::new(),
-        uart_pins: BTreeMap::new(),
-        pins: BTreeMap::new(),
-        files: 0,
+    let config = Config::read_from(computer, config).ok()?;
+    let values = |kind: fn(&str) -> bool, key: &'static str| {
+        let sections = config.sections().iter().filter(move |section| kind(section.kind()));
+        sections.filter_map(move |section| section.text(key)).map(str::to_owned)
     };
-    reader.file(config, &mut Vec::new())?;
     let is_spi = |pin: &String| name_of(pin).starts_with("spidev");
     let is_port = |pin: &String| ["tty", "serial"].iter().any(|kind| name_of(pin).starts_with(kind));
-    let on_line = |pin: &String| Some((reader.serials.get(&section_of(pin))?.clone(), pin.clone()));
-    let numbered = reader.pins.values().flat_map(|pins| pins.split(',')).filter(|pin| line_of(name_of(pin)).is_some());
-    let numbered =
-        numbered.filter_map(|pin| Some((reader.serials.get(&section_of(pin))?.clone(), name_of(pin).to_owned())));
+    let leds = || values(|kind| kind == "neopixel", "pin");
+    let on_line = |pin: String| Some((serial_of(&config, &pin)?, pin));
+    let pins = config.sections().iter().flat_map(pins).filter(|pin| line_of(name_of(pin)).is_some());
     Some(Printer {
-        numbered: numbered.collect(),
-        line_leds: reader.led_pins.values().filter(|pin| !is_spi(pin)).filter_map(on_line).collect(),
-        serials: reader.serials.into_values().collect(),
-        leds: reader.led_pins.into_values().filter(is_spi).collect(),
-        uarts: reader.uart_pins.into_values().filter(is_port).collect(),
+        serials: values(|kind| kind == "mcu", "serial").map(Into::into).collect(),
+        leds: leds().filter(is_spi).collect(),
+        line_leds: leds().filter(|pin| !is_spi(pin)).filter_map(on_line).collect(),
+        uarts: values(|kind| kind.starts_with("tmc"), "uart_pin").filter(is_port).collect(),
+        numbered: pins.filter_map(|pin| Some((serial_of(&config, pin)?, name_of(pin).to_owned()))).collect(),
     })
 }
 
-/// The section of a pin's MCU, as klippy reads the pin (`parse_pin` in klippy/pins.py).
-fn section_of(pin: &str) -> String {
-    let pin = pin.trim_start_matches(['^', '~', '!', ' ']);
-    match pin.split_once(':').map(|(mcu, _)| mcu.trim()) {
-        None | Some("mcu") => "mcu".into(),
-        Some(mcu) => format!("mcu {mcu}"),
-    }
+/// All pins in a section, as they are written there.
+pub(in crate::cli) fn pins(section: &Section) -> impl Iterator<Item = &str> {
+    let options = section.settings().iter().filter(|setting| setting.key.contains("pin"));
+    options.flat_map(|setting| setting.value.split(','))
+}
+
+/// The `serial` of a pin's MCU.
+fn serial_of(config: &Config, pin: &str) -> Option<PathBuf> {
+    let section = match mcu_of(pin)? {
+        mcu if mcu == MAIN => mcu,
+        mcu => format!("mcu {mcu}"),
+    };
+    config.section(&section)?.text("serial").map(Into::into)
+}
+
+/// The MCU of a pin.
+pub(in crate::cli) fn mcu_of(pin: &str) -> Option<String> {
+    Pin::parse(pin, true, true).ok().map(|pin| pin.chip)
 }
 
 /// A pin's name without the MCU before it.
@@ -72,70 +78,6 @@ pub(in crate::cli) fn name_of(pin: &str) -> &str {
 pub(super) fn line_of(name: &str) -> Option<(u32, u32)> {
     let (chip, line) = name.split_once('/').unwrap_or(("gpiochip0", name));
     Some((chip.strip_prefix("gpiochip")?.parse().ok()?, line.strip_prefix("gpio")?.parse().ok()?))
-}
-
-struct Reader<'a> {
-    computer: &'a Computer,
-    /// Indexed by the section's name.
-    serials: BTreeMap<String, PathBuf>,
-    led_pins: BTreeMap<String, String>,
-    uart_pins: BTreeMap<String, String>,
-    /// All pins, indexed by section and key.
-    pins: BTreeMap<(String, String), String>,
-    files: usize,
-}
-
-impl Reader<'_> {
-    /// Reads a file. `within` are the files that include it.
-    fn file(&mut self, path: &Path, within: &mut Vec<PathBuf>) -> Option<()> {
-        self.files += 1;
-        if self.files > FILES_MAX || within.iter().any(|outer| outer == path) {
-            return None;
-        }
-        // A link leads where it leads on the computer that is looked at.
-        let target = self.computer.follow(path).ok()?.pop()?;
-        let text = self.computer.text(self.computer.name(&target))?;
-        within.push(path.to_owned());
-        let mut section = String::new();
-        for line in text.lines() {
-            let line = without_comment(line).trim_end();
-            if let Some(header) = line.strip_prefix('[').and_then(|line| line.split(']').next()) {
-                section = header.trim().to_owned();
-                if let Some(pattern) = section.strip_prefix("include ") {
-                    let folder = path.parent().unwrap_or(Path::new("/"));
-                    for file in self.computer.matching(folder.join(pattern.trim())) {
-                        self.file(&self.computer.name(&file), within)?;
-                    }
-                }
-                continue;
-            }
-            let Some((key, value)) = line.split_once([':', '=']) else { continue };
-            let value = value.trim();
-            // An indented line belongs to the value before it: text of a macro.
-            if key.contains("pin") && !key.starts_with(char::is_whitespace) {
-                self.pins.insert((section.clone(), key.trim_end().to_owned()), value.to_owned());
-            }
-            match (section.split(' ').next(), key.trim_end()) {
-                (Some("mcu"), "serial") => drop(self.serials.insert(section.clone(), value.into())),
-                (Some("neopixel"), "pin") => drop(self.led_pins.insert(section.clone(), value.into())),
-                (Some(kind), "uart_pin") if kind.starts_with("tmc") => {
-                    drop(self.uart_pins.insert(section.clone(), value.into()));
-                }
-                _ => {}
-            }
-        }
-        within.pop();
-        Some(())
-    }
-}
-
-/// A line up to its comment. klippy itself cuts at any `#`, and gives the rest to Python's configparser. There a `;`
-/// begins a comment at the line's start or after white space.
-pub(in crate::cli) fn without_comment(line: &str) -> &str {
-    let line = line.split('#').next().unwrap_or_default();
-    let begins = |at: &usize| line[..*at].chars().next_back().is_none_or(char::is_whitespace);
-    let comment = line.match_indices(';').map(|(at, _)| at).find(begins);
-    &line[..comment.unwrap_or(line.len())]
 }
 
 /// For `fuzz/`: files of klippy that include each other. A byte 0 separates them.

@@ -188,7 +188,7 @@ pub(super) fn watchdog(computer: &Computer, instances: &[Instance], systemctl: O
     }
     if let [first, second, ..] = feeding[..] {
         let found = format!(
-            "{} and {} are both told to feed {WATCHDOG}, which only one program can do",
+            "{} and {} are both configured to feed {WATCHDOG}, and only one program can",
             first.name(),
             second.name()
         );
@@ -360,7 +360,7 @@ mod tests {
             tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}.service"), "x");
         }
         tree.put("etc/default/pinion-mcu-b", "PINION_OPTIONS=-w\n");
-        let remedy = told(&look(), "watchdog_device", Error, "pinion-mcu and pinion-mcu@b are both told");
+        let remedy = told(&look(), "watchdog_device", Error, "pinion-mcu and pinion-mcu@b are both configured");
         assert!(remedy.contains("/etc/pinion/b.toml"), "{remedy}");
     }
 }

@@ -171,7 +171,7 @@ fn access(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
     if klippy.unit.is_some() || judged.status == Level::Ok {
         return judged;
     }
-    Finding::warning(CHECK, judged.told, STRANGER)
+    Finding::warning(CHECK, judged.trouble, STRANGER)
 }
 
 fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {

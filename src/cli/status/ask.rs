@@ -87,7 +87,7 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
         Ok((status, unknown)) => {
             let notice = (!unknown.is_empty()).then(|| {
                 format!(
-                    "{path}: Pinion {} tells what pinion {own} does not know, and leaves out: {}: use the pinion of that version",
+                    "{path}: Pinion {} reports fields that pinion {own} does not know and does not show: {}: use the pinion of that version",
                     status.version,
                     unknown.join(", ")
                 )
@@ -98,7 +98,7 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
             Ok(Sender { version }) => format!(
                 "{path}: pinion {own} cannot read the status of Pinion {version}: {error}: use the pinion of that version"
             ),
-            Err(_) => format!("{path}: what answers there tells no status: {error}: is it a Pinion? (--socket)"),
+            Err(_) => format!("{path}: the answer is no status: {error}: is it a Pinion? (--socket)"),
         }),
     }
 }
@@ -162,6 +162,6 @@ mod tests {
             "{error}"
         );
         let error = answered(&json!({ "HTTP": 1.1 })).map(|_| ()).unwrap_err();
-        assert!(error.starts_with("/run/pinion/mcu.sock: what answers there tells no status: "), "{error}");
+        assert!(error.starts_with("/run/pinion/mcu.sock: the answer is no status: "), "{error}");
     }
 }

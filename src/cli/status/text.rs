@@ -5,7 +5,7 @@
 
 use crate::cli::page::{Page, aligned};
 use pinion_runtime::status::form::{
-    BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, Recorder, State, Status,
+    BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, RecorderStatus, State, Status,
 };
 
 /// Width of the column with the heads of the lines.
@@ -28,7 +28,7 @@ pub(super) fn page(status: &Status) -> Page {
         "guardian",
         status.guardian.pid.map_or("none, as this board needs none".into(), |pid| format!("process {pid}")),
     );
-    if let Some(Recorder { bytes, folder }) = &status.recorder {
+    if let Some(RecorderStatus { bytes, folder }) = &status.recorder {
         let memory = format!("up to {:.1} MB for the last ten seconds", *bytes as f64 / 1e6);
         let traces = folder.as_ref().map_or(String::new(), |folder| format!("; traces of stops in {folder}"));
         row("recorder", memory + &traces);

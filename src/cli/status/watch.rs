@@ -22,12 +22,12 @@ use super::ask::ask;
 use super::text::HEAD;
 use super::{StatusArgs, show};
 
-/// Time between two looks.
+/// Time between two questions.
 const PERIOD: Duration = Duration::from_secs(1);
 /// How long the loop may take to end after a signal: longer than an answer takes. A terminal that takes no output, as
 /// after Ctrl-S, keeps the loop forever.
 const GRACE: Duration = Duration::from_secs(6);
-/// Longest wait for a key before the loop looks for a signal.
+/// Longest wait for a key before the loop checks for a signal.
 const KEY_WAIT: Duration = Duration::from_millis(50);
 
 /// Prints the status each second, until it is asked to end.

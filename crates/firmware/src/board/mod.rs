@@ -113,7 +113,7 @@ pub trait Line: Send + Sync {
     /// "GPIO line read failed".
     fn read(&self) -> Result<bool, Shutdown>;
 
-    /// Makes the line an output or an input for all users. As in the firmware, the last setup of a line replaces the
+    /// Makes the line an output or an input for all users. As in Klipper's C, the last setup of a line replaces the
     /// earlier ones.
     ///
     /// # Errors

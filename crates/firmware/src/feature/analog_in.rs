@@ -120,7 +120,7 @@ struct AnalogIn {
     sample_at: Clock,
     /// How many samples the current sum has.
     taken: u8,
-    /// The sum of the samples. It wraps around, as the firmware's does.
+    /// The sum of the samples. It wraps around, as Klipper's does.
     sum: u16,
     /// The last sample.
     last: Option<u16>,
@@ -243,7 +243,7 @@ impl Object for AnalogIn {
                 if at_once || self.unread.is_too_long(read_at) {
                     context.try_shut_down(failure.clone())?;
                 }
-                // Drop this sum. The next one begins at its own time.
+                // Drop this sum. The next one begins at its due time.
                 self.restart();
                 self.skip_missed(context.now());
                 context.go_on(TIMER, self.next_begin);
@@ -283,7 +283,7 @@ impl Object for AnalogIn {
         if self.query.sample_count == 0 || self.query.rest_ticks == Ticks(0) {
             return;
         }
-        // Sampling continues, as in the firmware, so that the host also sees the temperatures of a stopped MCU.
+        // Sampling continues, as in Klipper's C, so that the host also sees the temperatures of a stopped MCU.
         self.skip_missed(context.now());
         context.go_on(TIMER, self.next_begin);
     }

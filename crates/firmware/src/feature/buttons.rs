@@ -38,7 +38,7 @@ response! {
 const BUTTONS: usize = 8;
 /// Highest number of states that wait for the host. Later changes are dropped.
 const REPORTS: usize = 8;
-/// Highest `retransmit_count`, as in the firmware.
+/// Highest `retransmit_count`, as in Klipper's C.
 const RETRANSMIT_MAX: u8 = 0x7f;
 
 const TIMER: Timer = Timer::sampling(0);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Commands of a host on a CAN bus: the node's identity and the health of the bus (the firmware's canserial.c).
+//! Commands of a host on a CAN bus: the node's identity and the health of the bus (Klipper's canserial.c).
 
 #![forbid(unsafe_code)]
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Counters of a pin's edges, for example of a fan's tachometer.
 //!
-//! The firmware polls the pin. Pinion polls it only where nothing better is available. If the board has interrupts, the
+//! Klipper's C polls the pin. Pinion polls it only where nothing better is available. If the board has interrupts, the
 //! kernel timestamps the edges and a worker reads them. The core then runs 20 timers per second instead of a thousand.
 //!
 //! Polling rarely sees a pulse much shorter than `poll_ticks`, for example noise on a fan's wire. An interrupt sees
@@ -26,7 +26,7 @@ pub(super) const FEATURE: Feature =
     Feature { commands: &[CONFIG_COUNTER, QUERY_COUNTER], responses: &[State::FORM], ..Feature::EMPTY };
 
 response! {
-    /// The edges so far, the time of the next look, and the time of the last edge. klippy assumes that the count was
+    /// The edges so far, the time of the next sample, and the time of the last edge. klippy assumes that the count was
     /// taken one `poll_ticks` before `next_clock`.
     "counter_state oid=%c next_clock=%u count=%u count_clock=%u"
     pub(super) struct State { oid: Oid, next_clock: Clock, count: u32, count_clock: Clock }
@@ -150,7 +150,7 @@ impl Job for Reading {
 /// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
-        "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
+        "counter ({name}): {per_s} edges a second are not from a fan, and their interrupts slow this computer down, so it is polled from now on: connect the pin, or give it a pull-up (^)"
     )
 }
 
@@ -174,12 +174,12 @@ struct Counter {
     counted: Option<Counted>,
     poll_ticks: Ticks,
     sample_ticks: Ticks,
-    /// When the next report is due. A polled pin reports at the first look after this time. A worker's read reports at
+    /// When the next report is due. A polled pin reports at the first sample after this time. A worker's read reports at
     /// this time or later.
     next_sample: Clock,
     /// Edges, modulo 2^32. While the pin is polled, the count is odd if the pin is high.
     count: u32,
-    /// When the last edge was seen. Before the first edge: when counting began. The firmware reports 0 there, and
+    /// When the last edge was seen. Before the first edge: when counting began. Klipper's C reports 0 there, and
     /// klippy takes 0 for some time that may lie in the future.
     count_clock: Clock,
     /// Whether the worker's result is for the current query.

@@ -194,7 +194,7 @@ struct SetLines(Vec<(Pin, OutputLine)>);
 impl SetLines {
     /// Drives a line. The line stays claimed.
     ///
-    /// The firmware allows this at any time. Here it works at any time for a line that is already claimed. A new line
+    /// Klipper's C allows this at any time. Here it works at any time for a line that is already claimed. A new line
     /// is refused after `finalize_config`. To claim it, the core would have to open files and wait for the guardian,
     /// and steps would wait too. klippy sets its lines before that.
     ///

@@ -3,7 +3,7 @@
 //!
 //! A reading takes 750 ms on a worker. Sensors that are powered by the data wire take turns, because the kernel keeps
 //! the bus while one of them measures: three take 2.25 s. So a `config_reset` does not wait for a reading. A reading is
-//! reported as soon as it arrives. The firmware reports it when the next one is due.
+//! reported as soon as it arrives. Klipper's C reports it when the next one is due.
 
 #![forbid(unsafe_code)]
 
@@ -41,7 +41,7 @@ response! {
     pub(super) struct Reading { oid: Oid, next_clock: Clock, value: i32, fault: u32 }
 }
 
-/// Longest time of a reading (`W1_READ_TIMEOUT_SEC` of the firmware).
+/// Longest time of a reading (`W1_READ_TIMEOUT_SEC` of Klipper's C).
 const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 
 const TIMER: Timer = Timer::sampling(0);

@@ -455,7 +455,7 @@ impl<C: FifoChip> FifoSensor<C> {
         Ok(())
     }
 
-    /// Measures, with `rest_ticks` between two looks into the FIFO. `rest_ticks` of 0 ends the measurement.
+    /// Measures, with `rest_ticks` between two polls of the FIFO. `rest_ticks` of 0 ends the measurement.
     pub(super) fn query(&mut self, context: &mut Context, rest_ticks: Ticks) -> Result<(), Shutdown> {
         context.cancel(TIMER);
         self.end();

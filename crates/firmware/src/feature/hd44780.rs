@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Text displays with an HD44780, on four data lines.
 //!
-//! The times are from Hitachi's data sheet at 5 V (HD44780U, "Bus timing characteristics"), as in the firmware. The
+//! The times are from Hitachi's data sheet at 5 V (HD44780U, "Bus timing characteristics"), as in Klipper's C. The
 //! host says how long the display needs after a byte.
 
 #![forbid(unsafe_code)]

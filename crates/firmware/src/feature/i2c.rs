@@ -76,7 +76,7 @@ const RESPONSE_MAX: usize = PAYLOAD_MAX - 6;
 
 const SUCCESS: u8 = 0;
 
-/// The number and the text of a status, from the firmware's i2ccmds.h and i2ccmds.c.
+/// The number and the text of a status, from Klipper's i2ccmds.h and i2ccmds.c.
 fn on_wire(status: BusStatus) -> (u8, ShutdownReason) {
     match status {
         BusStatus::Nack => (1, I2C_NACK),
@@ -92,7 +92,7 @@ fn statuses() -> Vec<Range> {
     names.iter().zip(SUCCESS.into()..).map(|(name, first)| Range { name: (*name).into(), first, count: 1 }).collect()
 }
 
-/// The shutdown for a sensor that cannot be reached (the firmware's `i2c_shutdown_on_err`).
+/// The shutdown for a sensor that cannot be reached (Klipper's `i2c_shutdown_on_err`).
 pub(super) fn i2c_shutdown(context: &Context, error: BusError) -> Shutdown {
     let reason = if context.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
     Shutdown::because(reason, error.trouble)
@@ -140,7 +140,7 @@ impl Transfer {
         Transfer { purpose, writes_back: false, write: bytes, write_len, read: [0; u8::MAX as usize], read_len }
     }
 
-    /// The bytes for which the answer has room, as in the firmware.
+    /// The bytes for which the answer has room, as in Klipper's C.
     fn response(&self) -> &[u8] {
         &self.read[..self.read_len.min(RESPONSE_MAX)]
     }
@@ -212,7 +212,7 @@ impl I2c {
     /// Starts a transfer for the running command.
     fn transfer(&mut self, context: &mut Context, transfer: Transfer) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
-            // The firmware answers the same for a device without a bus.
+            // Klipper's C answers the same for a device without a bus.
             let status = BusStatus::Nack;
             if let Purpose::Transfer = transfer.purpose {
                 let i2c_bus_status = on_wire(status).0;
@@ -303,7 +303,7 @@ const I2C_SET_BUS: Command = command!(
 )
 .of(since(V0_12));
 
-/// Half a period at 100 kHz. The firmware used this rate whatever rate it was given.
+/// Half a period at 100 kHz. Klipper's C used this rate whatever rate it was given.
 const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
 
 const I2C_SET_SOFTWARE_BUS: Command = command!(
@@ -358,12 +358,12 @@ const I2C_TRANSFER: Command =
     })
     .of(since(Master));
 
-/// A count of bytes has one byte, as in the firmware.
+/// A count of bytes has one byte, as in Klipper's C.
 fn one_byte(count: u32) -> usize {
     usize::from(count as u8)
 }
 
-/// An address has 7 bits. The firmware drops the others.
+/// An address has 7 bits. Klipper's C drops the others.
 fn seven_bits(address: u32) -> u8 {
     (address & 0x7f) as u8
 }

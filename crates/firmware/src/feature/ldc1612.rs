@@ -4,7 +4,7 @@
 //! klippy itself sets up the chip. The chip's INTB line goes low when a sample is ready. Without that line Pinion reads
 //! the STATUS register every `rest_ticks`. A failing bus stops nothing: the host gets an error in the sample's place,
 //! and homing ends. The hosts v0.13 and Kalico do not know these errors. For them a failing bus stops the MCU, as it
-//! did in the firmware.
+//! did in Klipper's C.
 
 #![forbid(unsafe_code)]
 
@@ -239,7 +239,7 @@ impl Ldc1612 {
         self.look.send_to(context, self.i2c)
     }
 
-    /// Makes up for the turns that came while the sensor was read. The firmware's timer waits for the bus. So the first
+    /// Makes up for the turns that came while the sensor was read. Klipper's timer waits for the bus. So the first
     /// of these turns runs now, and each further one counts as possibly lost samples.
     fn make_up(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let missed = std::mem::take(&mut self.missed);

@@ -78,7 +78,7 @@ impl Model {
             Model::Lis3dh if status & 0x20 != 0 => 0,
             Model::Lis3dh => status & 0x1f,
         };
-        // A wire that reads as all ones says 63 samples. The firmware keeps the bytes of that modulo 256: two blocks.
+        // A wire that reads as all ones says 63 samples. Klipper's C keeps the bytes of that modulo 256: two blocks.
         let bytes = samples.wrapping_mul(SAMPLE_BYTES as u8);
         Fill { bytes: bytes.into(), overflowed: status & 0x40 != 0 }
     }

@@ -210,7 +210,7 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
             awaits: true,
             begin,
             rest_ticks,
-            // The firmware keeps its low byte.
+            // Klipper's C keeps its low byte.
             watchdog_max: timeout as u8,
             watchdog_count: 0,
         });

@@ -44,7 +44,7 @@ response! {
 /// Shortest time that the line is low before and after the colors. klippy asks for 50 us. Newer WS2812B need 280 us to
 /// take their colors (Worldsemi WS2812B-V5, "Data transfer time": RES).
 const RESET_MIN: Ticks = Ticks::from_us(300);
-/// Lowest size and position that are refused, as in the firmware.
+/// Lowest size and position that are refused, as in Klipper's C.
 const SIZE_LIMIT: u16 = 0x8000;
 
 /// The way to the LEDs.

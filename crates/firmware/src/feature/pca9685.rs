@@ -75,7 +75,7 @@ const RATE_HZ: u32 = 100_000;
 fn prescale(cycle: Ticks) -> u8 {
     let divisor = u64::from(VALUE_MAX) * u64::from(CLOCK_FREQ);
     let rounded = (OSCILLATOR_HZ * u64::from(cycle.0) + divisor / 2) / divisor;
-    // A period close to zero becomes the longest one, as in the firmware.
+    // A period close to zero becomes the longest one, as in Klipper's C.
     rounded.wrapping_sub(1).clamp(3, 0xff) as u8
 }
 

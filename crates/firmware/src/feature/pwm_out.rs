@@ -55,7 +55,7 @@ impl Settable for Channel {
     }
 }
 
-/// Opens a channel. As in the firmware, several objects may have the same channel, each with its own files.
+/// Opens a channel. As in Klipper's C, several objects may have the same channel, each with its own files.
 fn open(context: &mut Context, number: u8, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
     let OnWorker { bus, device: pwm } = context.board()?.pwm(config)?;
     let calls = Calls::new(context.clock());

@@ -6,7 +6,7 @@
 //! timer then leaves the chip alone for 8 `rest_ticks`. A reading that is not back by then may have cost the next
 //! sample. It is counted as a possible overflow.
 //!
-//! The core cannot read the line if it is the data input of an SPI controller. Then the worker looks as often, and reads
+//! The core cannot read the line if it is the data input of an SPI controller. Then the worker polls as often, and reads
 //! the sample if there is one.
 
 #![forbid(unsafe_code)]
@@ -94,12 +94,12 @@ const VALUE_BYTES: usize = 4;
 pub(super) enum Ready {
     /// This line is low.
     Line(Arc<dyn Line>),
-    /// The worker looks. `waits` counts the `rest_ticks` since the look began. `fresh`: it has just read a sample.
+    /// The worker polls. `waits` counts the `rest_ticks` since the poll began. `fresh`: it has just read a sample.
     Look { waits: u32, fresh: bool },
 }
 
 impl Ready {
-    /// The worker looks.
+    /// The worker polls.
     pub(super) const LOOK: Ready = Ready::Look { waits: 0, fresh: false };
 }
 
@@ -158,7 +158,7 @@ impl<C: ReadyChip> ReadyAdc<C> {
     }
 
     /// Reports to the host how many samples there are. A sample that is being read counts as one in the chip. If the
-    /// worker has to look, a sample in the chip does not count yet.
+    /// worker has to poll, a sample in the chip does not count yet.
     pub(super) fn query_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let now = context.now();
         let ready = match &self.ready {
@@ -186,7 +186,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
                 *waits += 1;
                 (false, if *waits < READING_RESTS { 1 } else { 4 })
             }
-            // The next look begins 8 `rest_ticks` after the one that read a sample.
+            // The next poll begins 8 `rest_ticks` after the one that read a sample.
             Ready::Look { waits, fresh } if *fresh && *waits + 1 < READING_RESTS => {
                 *fresh = false;
                 (false, READING_RESTS - 1 - *waits)

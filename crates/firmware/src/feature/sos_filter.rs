@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Filters of second-order sections in fixed point, for the samples of a sensor that triggers.
 //!
-//! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals the
-//! firmware's to the bit, even if its 32-bit sums wrap.
+//! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals
+//! that of Klipper's C to the bit, even if its 32-bit sums wrap.
 
 #![forbid(unsafe_code)]
 
@@ -42,7 +42,7 @@ const FRAC_BITS_MASK: u8 = 0x3f;
 fn fixed_mul(coefficient: i32, value: i32, frac_bits: u8) -> Result<i32, Overflow> {
     let mut product = i64::from(coefficient) * i64::from(value);
     if frac_bits > 0 {
-        // Wraps for -2^31 times -2^31 with 63 fractional bits, as on the firmware's processors.
+        // Wraps for -2^31 times -2^31 with 63 fractional bits, as on the processors of Klipper's C.
         product = product.wrapping_add(1 << (frac_bits - 1)) >> frac_bits;
     }
     i32::try_from(product).map_err(|_| Overflow)
@@ -324,7 +324,7 @@ mod tests {
         filter
     }
 
-    /// The results of the firmware's C program for these samples. They include an overflow of the offset and one of a
+    /// The results of Klipper's C program for these samples. They include an overflow of the offset and one of a
     /// section.
     #[test]
     fn a_low_pass_answers_as_the_firmware() {

@@ -166,7 +166,7 @@ impl Spi {
         if self.bus.is_some() {
             return Err(invalid("it has a bus already"));
         }
-        // The firmware opens a bus even then. Here the core would have to wait for the files, and steps with it.
+        // Klipper's C opens a bus even then. Here the core would have to wait for the files, and steps with it.
         if context.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
@@ -190,7 +190,7 @@ impl Spi {
             return Ok(());
         }
         let [miso, mosi, sclk] = pins;
-        // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
+        // Klipper's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {
             miso: context.shared_input(miso)?,
             mosi: context.shared_output(mosi, false)?,
@@ -207,7 +207,7 @@ impl Spi {
     /// Starts a transfer: with an answer for `spi_transfer`, without one for `spi_send`.
     fn transfer(&mut self, context: &mut Context, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
-            // A device without a bus echoes, as in the firmware.
+            // A device without a bus echoes, as in Klipper's C.
             if answers {
                 context.send(TransferResponse { oid: context.oid(), response: data });
             }
@@ -342,7 +342,7 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
     |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        // The firmware ignored the rate and was as fast as its system calls. Lines that are written through mapped
+        // Klipper's C ignored the rate and was as fast as its system calls. Lines that are written through mapped
         // registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
         spi.set_lines(context, pins, mode, pulse)
@@ -354,7 +354,7 @@ const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
     Spi,
     |spi, context, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
-        // The mode has one byte, as in the firmware.
+        // The mode has one byte, as in Klipper's C.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
         spi.set_lines(context, pins, mode, pulse_ticks)

@@ -60,7 +60,7 @@ struct Move {
     reverses: bool,
 }
 
-/// The intervals of a move, in 32 bits as in the firmware. A part of a tick that an interval has left over goes into the
+/// The intervals of a move, in 32 bits as in Klipper's C. A part of a tick that an interval has left over goes into the
 /// next one.
 #[derive(Default)]
 struct Intervals {
@@ -70,7 +70,7 @@ struct Intervals {
     add2: i32,
     /// An interval has 2 to the power of `shift` units to a tick.
     shift: u8,
-    /// The units that are left over. The firmware has 16 bits for them.
+    /// The units that are left over. Klipper's C has 16 bits for them.
     left: u16,
 }
 
@@ -146,8 +146,8 @@ struct Stepper {
 /// MCU that is 50 ms late has more steps to make than it can. Other timers must not wait for these.
 const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
 
-/// A call of the kernel takes longer than this, 100 ns. So a line that is not fast holds a pulse of 100 ns without
-/// a look at the clock.
+/// A call of the kernel takes longer than this, 100 ns. So a line that is not fast holds a pulse of 100 ns, and
+/// the clock need not be read.
 const CALL: Ticks = Ticks(5);
 
 /// Keeps the position's top bit free for the direction.
@@ -173,7 +173,7 @@ impl Stepper {
             // After a long pause the interval has wrapped, but the step's 32-bit clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
             self.next_step = context.instant(WireClock(clock));
-            // Any earlier pulse is over, as for the firmware.
+            // Any earlier pulse is over, as for Klipper's C.
             self.earliest = self.next_step;
             if reverses {
                 self.dir.toggle()?;
@@ -224,7 +224,7 @@ impl Stepper {
     }
 
     /// Moves on to the next step, `interval` later on a 32-bit clock. A time that is 2^31 ticks or more after
-    /// `earliest` counts as past, as in the firmware's comparisons.
+    /// `earliest` counts as past, as in Klipper's comparisons.
     #[inline]
     fn advance(&mut self, interval: u32, earliest: Clock) {
         self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);

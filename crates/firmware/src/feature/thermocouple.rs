@@ -120,7 +120,7 @@ fn types(_board: &dyn Board) -> Vec<Range> {
     Chip::ALL.iter().zip(0..).map(|((_, name), first)| Range { name: (*name).into(), first, count: 1 }).collect()
 }
 
-/// One look at the chip.
+/// One reading of the chip.
 struct Look(Chip);
 
 impl Job for Look {
@@ -220,7 +220,7 @@ const CONFIG_THERMOCOUPLE: Command = command!(
     "config_thermocouple oid=%c spi_oid=%c thermocouple_type=%c",
     |context, oid: Oid, spi_oid: Oid, thermocouple_type: u8| {
         let Some((chip, _)) = Chip::ALL.get(usize::from(thermocouple_type)).copied() else {
-            let what = format_args!("thermocouple_type {thermocouple_type} is none");
+            let what = format_args!("there is no thermocouple_type {thermocouple_type}");
             return Err(Shutdown::by_host(INVALID_TYPE, what));
         };
         context.require::<Spi>(spi_oid)?;

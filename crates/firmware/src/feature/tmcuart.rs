@@ -44,7 +44,7 @@ response! {
 const WORKER: &str = "tmcuart";
 /// Highest number of bytes in a message, with start and stop bits: eight bytes of ten bits.
 const DATA_MAX: usize = 10;
-/// How long the line is quiet between the command and the first edge, as in the firmware. A driver wants a quiet line
+/// How long the line is quiet between the command and the first edge, as in Klipper's C. A driver wants a quiet line
 /// between messages.
 const QUIET: Ticks = Ticks::from_us(200);
 /// How long to wait after a message before looking for the reply, in bits.
@@ -139,7 +139,7 @@ struct TmcUart {
 
 impl TmcUart {
     fn send(&mut self, context: &mut Context, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
-        // As in the firmware: a busy UART ignores the command, and the host asks again.
+        // As in Klipper's C: a busy UART ignores the command, and the host asks again.
         let Some(exchange) = self.exchange.here().filter(|_| !self.asked) else { return Ok(()) };
         let read_len = usize::from(read_len);
         if write.len() > DATA_MAX || read_len > DATA_MAX {

@@ -44,7 +44,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A `trigger_analog_type` outside the enumeration. (Pinion's own text. In the firmware nothing triggers then.)
+    /// A `trigger_analog_type` outside the enumeration. (Pinion's own text. In Klipper's C nothing triggers then.)
     INVALID_TYPE = "Invalid trigger_analog_type";
 }
 
@@ -136,7 +136,7 @@ impl TriggerAnalog {
         self.pull(context, self.trigger_reason)
     }
 
-    /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as unsigned, except
+    /// Whether a filtered value pulls the trigger. Klipper's C compares a negative trigger value as unsigned, except
     /// for [`TriggerType::Gt`].
     fn crosses(&mut self, value: i32) -> bool {
         match self.trigger_type {
@@ -169,8 +169,8 @@ impl Object for TriggerAnalog {
         "analog trigger"
     }
 
-    /// Checks whether the sensor is silent, and pulls the trigger if it is. Later samples are still checked, as in the
-    /// firmware: a trsync is pulled only once.
+    /// Checks whether the sensor is silent, and pulls the trigger if it is. Later samples are still checked, as in
+    /// Klipper's C: a trsync is pulled only once.
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if !self.homing {
             return Ok(Next::Done);
@@ -303,7 +303,7 @@ const TRIGGER_ANALOG_HOME: Command = command!(
         trigger.trigger_reason = trigger_reason;
         trigger.error_reason = error_reason;
         trigger.homing_clock = at;
-        // The firmware keeps its low byte.
+        // Klipper's C keeps its low byte.
         trigger.monitor_max = monitor_max as u8;
         trigger.monitor_count = 0;
         trigger.homing = true;

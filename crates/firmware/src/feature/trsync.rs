@@ -166,7 +166,7 @@ const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", Trsy
     context.cancel(REPORT);
     context.cancel(EXPIRE);
     let trigger_reason = trsync.trigger_reason;
-    // The host itself pulled the trigger and does not need to know when. The clock is 0, as in the firmware.
+    // The host itself pulled the trigger and does not need to know when. The clock is 0, as in Klipper's C.
     context.send(State { oid: context.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
     Ok(())
 });

@@ -48,7 +48,7 @@ const RESPONSES: &[Form] = &[
     IsShutdown::FORM,
     Stats::FORM,
     Pong::FORM,
-    // Never sent, because `debug_read` is refused. The firmware's dictionary has it.
+    // Never sent, because `debug_read` is refused. Klipper's dictionary has it.
     Form { format: "debug_result val=%u", dialects: Dialects::ALL },
 ];
 

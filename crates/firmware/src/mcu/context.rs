@@ -136,7 +136,7 @@ impl<'a> Context<'a> {
     }
 
     /// Returns the given shutdown as an error, which then stops the MCU. Returns `Ok` if the MCU is already stopped
-    /// (the firmware's `try_shutdown`).
+    /// (Klipper's `try_shutdown`).
     ///
     /// # Errors
     ///

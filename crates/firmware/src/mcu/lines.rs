@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! GPIO lines: the table of claims, and how features claim a line.
 //!
-//! Several objects may use one line, as in the firmware, which sets the line up again. Examples:
+//! Several objects may use one line, as in Klipper's C, which sets the line up again. Examples:
 //!
 //! - `[duplicate_pin_override]` in printer.cfg
 //! - a line that `set_digital_out` drove before an object claimed it

@@ -80,8 +80,8 @@ impl HostWire {
 }
 
 impl Mcu {
-    /// Runs the first command of a block's payload. If it stops the MCU, the rest of the block is dropped, as in the
-    /// firmware. Do not call this while the MCU [is held](Mcu::is_held).
+    /// Runs the first command of a block's payload. If it stops the MCU, the rest of the block is dropped, as in
+    /// Klipper's C. Do not call this while the MCU [is held](Mcu::is_held).
     #[inline]
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
         let command = *payload;

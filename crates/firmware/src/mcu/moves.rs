@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use crate::shutdown::{Shutdown, reason};
 
-/// Number of moves (`move_count`), as in the firmware on Linux.
+/// Number of moves (`move_count`), as in Klipper's C on Linux.
 pub const MOVE_COUNT: u16 = 1024;
 
 /// Counts the free moves. There are none before `finalize_config`.

@@ -15,7 +15,7 @@ use super::{Context, Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
 
 /// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
-/// How many timers run before the MCU checks the delay and commands get a turn (`TIMER_REPEAT_COUNT` of the firmware's
+/// How many timers run before the MCU checks the delay and commands get a turn (`TIMER_REPEAT_COUNT` of Klipper's
 /// linux/timer.c).
 const REPEAT_COUNT: u32 = 20;
 /// The same after a turn without a command to run (`TIMER_IDLE_REPEAT_COUNT`).
@@ -146,7 +146,7 @@ impl Scheduler {
 
     /// Starts a timer. It is too close if it is the first of all timers and its time has passed.
     pub(super) fn schedule(&mut self, timer: TimerId, at: Clock, is_stopped: bool) -> Result<(), Shutdown> {
-        // In the firmware, the running timer is still the first of the queue.
+        // In Klipper's C, the running timer is still the first of the queue.
         let first = self.timing.due.get().or(self.timers.next());
         self.timers.insert(at, timer);
         if first.is_none_or(|first| at < first) && !is_stopped {
@@ -250,7 +250,7 @@ impl Mcu {
     /// Runs the due timers, up to a limit, so that commands get their turn. True if more timers are due: then one
     /// command gets its turn, if there is one.
     ///
-    /// The firmware runs 20 timers and checks if they are too late. Then it lets commands run. If there are none, it
+    /// Klipper's C runs 20 timers and checks if they are too late. Then it lets commands run. If there are none, it
     /// runs 100 more timers before the next check. Pinion does the same, because the place of this check decides if the
     /// MCU stops. A batch counts as one timer.
     pub fn run_timers(&mut self) -> bool {

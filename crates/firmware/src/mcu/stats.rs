@@ -18,7 +18,7 @@ pub(super) struct Stats {
 }
 
 impl Stats {
-    /// Adds a busy span. The sum of squares saturates, as in the firmware.
+    /// Adds a busy span. The sum of squares saturates, as in Klipper's C.
     pub(super) fn add(&mut self, busy: Ticks) {
         let square = u64::from(busy.0) * u64::from(busy.0);
         let square = square.div_ceil(u64::from(SUMSQ_BASE));

@@ -57,7 +57,7 @@ pub struct CanHealth {
     pub state: CanState,
 }
 
-/// The state of a CAN node (ISO 11898-1). The numbers are the firmware's (`canbus_bus_state`).
+/// The state of a CAN node (ISO 11898-1). The numbers are Klipper's (`canbus_bus_state`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CanState {
     /// It sends and receives.
@@ -72,7 +72,7 @@ pub enum CanState {
 }
 
 impl CanState {
-    /// All states with the firmware's names, in the order of their numbers.
+    /// All states with Klipper's names, in the order of their numbers.
     pub const ALL: [(CanState, &'static str); 4] = [
         (CanState::Active, "active"),
         (CanState::Warn, "warn"),

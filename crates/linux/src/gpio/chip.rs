@@ -11,7 +11,7 @@ use gpio_cdev::LineDirection;
 use super::refusal::{cannot_open, errno};
 use super::registers::Places;
 use super::{ChipRegisters, FastGpio};
-use crate::{ASPM_POLICY, DEV, GPIO};
+use crate::places::{ASPM_POLICY, DEV, GPIO};
 use pinion_firmware::trouble::Trouble;
 
 /// Subsystems whose drivers send messages to their devices and sleep until the answer comes.

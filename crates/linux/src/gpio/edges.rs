@@ -101,7 +101,7 @@ fn no_edges(code: i32) -> Box<str> {
         libc::EINVAL | libc::ENOTTY => "this needs Linux 5.10 and a driver that supports it".to_owned(),
         _ => text(code),
     };
-    format!("the kernel does not tell of its edges ({why})").into()
+    format!("the kernel does not report its edges ({why})").into()
 }
 
 impl Line for EdgeLine {

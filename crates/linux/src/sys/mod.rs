@@ -287,7 +287,7 @@ pub fn make_exclusive(terminal: &impl AsFd) -> io::Result<()> {
     Ok(())
 }
 
-/// Takes back [`make_exclusive`], whoever has called it.
+/// Takes back [`make_exclusive`], also that of another program.
 pub fn make_shared(terminal: &impl AsFd) -> io::Result<()> {
     // SAFETY: the request takes nothing.
     unsafe { request::tiocnxcl(terminal.as_fd().as_raw_fd()) }?;

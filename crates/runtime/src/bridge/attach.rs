@@ -19,7 +19,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{monotonic, poll_timeout};
 
-use super::{Flow, Heard, SILENCE_MAX, SYNC, Wire, read_some, write_some};
+use super::{Flow, Incoming, SILENCE_MAX, SYNC, Wire, read_some, write_some};
 use crate::process::signals::hang_up;
 use crate::transport::stdio::Lent;
 use crate::trouble::refused;
@@ -80,7 +80,7 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
         let [from_mcu, output, from_host] = fds.map(|fd| fd.revents().unwrap_or(PollFlags::empty()));
         if from_mcu.intersects(PollFlags::POLLIN | PollFlags::POLLHUP)
             && wire.outward.has_room()
-            && wire.outward.fill(|buffer| read_some(&*terminal, buffer)).map_err(lost)?.0 == Heard::Over
+            && wire.outward.fill(|buffer| read_some(&*terminal, buffer)).map_err(lost)?.0 == Incoming::Over
         {
             return Err(Trouble::new("Pinion has ended").of(link.display()).remedy(START));
         }
@@ -92,19 +92,19 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
             wire.forgive_silence();
         } else if !from_host.is_empty() {
             let (heard, bytes) = wire.read(&mut inward).map_err(broken)?;
-            // A sign of life is no host.
+            // A keepalive is no host.
             is_host_there |= bytes.iter().any(|byte| *byte != SYNC);
             if !is_host_there {
                 inward.clear();
             }
-            if heard == Heard::Over {
+            if heard == Incoming::Over {
                 ends_at = Some(monotonic() + FAREWELL);
             }
         }
     }
 }
 
-/// Opens a terminal like a host does. Another `pinion attach` cannot open it meanwhile.
+/// Opens a terminal like a host does. Another `pinion attach` cannot open it until this one ends.
 fn open(link: &Path) -> Result<Flock<File>, Trouble> {
     let flags = OFlag::O_NOCTTY | OFlag::O_NONBLOCK;
     let opened = OpenOptions::new().read(true).write(true).custom_flags(flags.bits()).open(link);

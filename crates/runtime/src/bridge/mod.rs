@@ -37,7 +37,7 @@ const FLOW_BYTES: usize = 4096;
 
 /// The result of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Heard {
+enum Incoming {
     /// This many bytes came, or none.
     Bytes(usize),
     /// There will be no more.
@@ -69,12 +69,12 @@ impl Flow {
     }
 
     /// Takes in what `input` has, and returns these bytes.
-    fn fill(&mut self, input: impl FnOnce(&mut [u8]) -> io::Result<Heard>) -> io::Result<(Heard, &mut [u8])> {
+    fn fill(&mut self, input: impl FnOnce(&mut [u8]) -> io::Result<Incoming>) -> io::Result<(Incoming, &mut [u8])> {
         let before = self.0.len();
         self.0.resize(before.max(FLOW_BYTES), 0);
         let heard = input(&mut self.0[before..]);
         let bytes = match &heard {
-            Ok(Heard::Bytes(bytes)) => *bytes,
+            Ok(Incoming::Bytes(bytes)) => *bytes,
             _ => 0,
         };
         self.0.truncate(before + bytes);
@@ -91,7 +91,7 @@ impl Flow {
     }
 }
 
-/// The connection to the other end: two descriptors, and signs of life.
+/// The connection to the other end: two descriptors, and keepalives.
 struct Wire {
     input: OwnedFd,
     output: OwnedFd,
@@ -116,7 +116,7 @@ impl Wire {
     }
 
     /// Reads what the other end has sent into `flow`, and returns these bytes.
-    fn read<'a>(&mut self, flow: &'a mut Flow) -> io::Result<(Heard, &'a mut [u8])> {
+    fn read<'a>(&mut self, flow: &'a mut Flow) -> io::Result<(Incoming, &'a mut [u8])> {
         self.heard_at = monotonic();
         flow.fill(|buffer| read_some(&self.input, buffer))
     }
@@ -129,7 +129,7 @@ impl Wire {
         self.outward.drain(|bytes| write_some(&self.output, bytes))
     }
 
-    /// Sends a sign of life if one is due.
+    /// Sends a keepalive if one is due.
     fn give_sign(&mut self) -> io::Result<()> {
         if self.outward.is_empty() && monotonic() >= self.said_at + SIGN_EVERY {
             self.outward.push(&[SYNC]);
@@ -153,13 +153,13 @@ impl Wire {
     }
 }
 
-fn read_some(fd: impl AsFd, buffer: &mut [u8]) -> io::Result<Heard> {
+fn read_some(fd: impl AsFd, buffer: &mut [u8]) -> io::Result<Incoming> {
     match read(fd, buffer) {
-        Ok(0) if !buffer.is_empty() => Ok(Heard::Over),
-        Ok(bytes) => Ok(Heard::Bytes(bytes)),
-        Err(Errno::EAGAIN | Errno::EINTR) => Ok(Heard::Bytes(0)),
+        Ok(0) if !buffer.is_empty() => Ok(Incoming::Over),
+        Ok(bytes) => Ok(Incoming::Bytes(bytes)),
+        Err(Errno::EAGAIN | Errno::EINTR) => Ok(Incoming::Bytes(0)),
         // A terminal or a socket whose other end is gone.
-        Err(Errno::EIO | Errno::ECONNRESET) => Ok(Heard::Over),
+        Err(Errno::EIO | Errno::ECONNRESET) => Ok(Incoming::Over),
         Err(error) => Err(error.into()),
     }
 }

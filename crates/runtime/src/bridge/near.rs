@@ -22,12 +22,11 @@ use pinion_linux::clock::{monotonic, poll_timeout};
 
 use super::round_trip::RoundTrips;
 use super::ssh::{Ssh, Target};
-use super::{Flow, Heard, SYNC};
+use super::{Flow, Incoming, SYNC};
 use crate::process::notify::Notify;
 use crate::process::signals::{Signal, Signals};
-use crate::transport::Heard as FromHost;
-use crate::transport::Link;
 use crate::transport::pty::{Access, Pty};
+use crate::transport::{Input, Transport};
 use crate::trouble::{no_room, refused};
 
 /// The pauses between attempts to connect. Each is twice the one before.
@@ -58,7 +57,7 @@ pub fn link(link: &Path, target: Target) -> Result<(), Trouble> {
         is_attached: false,
         state: State::Waiting { until: Duration::ZERO },
         pause: PAUSE_MIN,
-        told: String::new(),
+        logged: String::new(),
         to_host: Flow::new(),
         trips: RoundTrips::default(),
         report_at: Duration::MAX,
@@ -99,7 +98,7 @@ struct Near {
     state: State,
     pause: Duration,
     /// The last log line about a lost connection. Each attempt may fail in the same way.
-    told: String,
+    logged: String,
     to_host: Flow,
     trips: RoundTrips,
     report_at: Duration,
@@ -114,7 +113,7 @@ impl Near {
             State::Waiting { .. } => match self.target.connect() {
                 Ok(ssh) => {
                     self.state = State::Connecting { ssh, since: now };
-                    self.tell("connecting");
+                    self.publish("connecting");
                     false
                 }
                 Err(trouble) => {
@@ -233,8 +232,8 @@ impl Near {
                     .outward
                     .fill(|buffer| {
                         Ok(match pty.read(buffer, false)? {
-                            FromHost::Bytes(bytes) => Heard::Bytes(bytes),
-                            FromHost::Gone | FromHost::Over => Heard::Over,
+                            Input::Bytes(bytes) => Incoming::Bytes(bytes),
+                            Input::Gone | Input::Over => Incoming::Over,
                         })
                     })
                     .map_err(about)?;
@@ -247,7 +246,7 @@ impl Near {
             None if !self.is_attached => {
                 warn!("{} is not connected: what was written to {} is lost", self.target.host, self.link.display());
                 let mut lost = [0; 4096];
-                while pty.read(&mut lost, false).map_err(about)? != FromHost::Bytes(0) {}
+                while pty.read(&mut lost, false).map_err(about)? != Input::Bytes(0) {}
             }
             None => {}
         }
@@ -278,7 +277,7 @@ impl Near {
         let (State::Connecting { ssh, .. } | State::Up { ssh }) = &mut self.state else { return Ok(()) };
         let Some(wire) = ssh.wire() else { return Ok(()) };
         let before = self.to_host.0.len();
-        let Ok((Heard::Bytes(_), bytes)) = wire.read(&mut self.to_host) else { return self.lose() };
+        let Ok((Incoming::Bytes(_), bytes)) = wire.read(&mut self.to_host) else { return self.lose() };
         let now = monotonic();
         self.trips.received(bytes, now);
         if let State::Connecting { since, .. } = self.state {
@@ -290,8 +289,8 @@ impl Near {
             self.to_host.0.drain(..=before + sign);
             let took_s = now.saturating_sub(since).as_secs_f64();
             info!("connected to {} within {took_s:.1} s", self.target.host);
-            self.tell("connected");
-            self.told.clear();
+            self.publish("connected");
+            self.logged.clear();
             self.pause = PAUSE_MIN;
             if let State::Connecting { ssh, .. } =
                 std::mem::replace(&mut self.state, State::Waiting { until: Duration::ZERO })
@@ -323,14 +322,14 @@ impl Near {
         Ok(())
     }
 
-    /// Tells why there is no connection, and when to try again.
+    /// Logs why there is no connection, and when the next try is.
     fn retry(&mut self, trouble: Trouble) {
         let line = trouble.to_string();
-        if line != self.told {
+        if line != self.logged {
             warn!("{line} (tried again until it works)");
-            self.told = line;
+            self.logged = line;
         }
-        self.tell("not connected");
+        self.publish("not connected");
         self.state = State::Waiting { until: monotonic() + self.pause };
         self.pause = (2 * self.pause).min(PAUSE_MAX);
     }
@@ -346,7 +345,7 @@ impl Near {
         }
     }
 
-    fn tell(&self, state: &str) {
+    fn publish(&self, state: &str) {
         self.notify.status(&format!("serving on {}, {state}: {}", self.link.display(), self.target.host));
     }
 }

@@ -17,7 +17,7 @@ use nix::unistd::Pid;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
-use super::{Heard, SILENCE_MAX, Wire, read_some};
+use super::{Incoming, SILENCE_MAX, Wire, read_some};
 use crate::trouble::refused;
 
 /// ssh's options. It never asks a person. Its own packets for a network that has gone end it as soon as the bridge
@@ -43,7 +43,7 @@ const SSH_FAILED: i32 = 255;
 const NOT_FOUND: i32 = 127;
 /// How long ssh may take to end.
 const END_MAX: Duration = Duration::from_secs(2);
-/// How often to look whether it has ended.
+/// How often to check whether it has ended.
 const LOOK: Duration = Duration::from_millis(10);
 /// Longest part of its messages that is kept. The last one counts.
 const MESSAGES_BYTES: usize = 4096;
@@ -156,12 +156,12 @@ impl Ssh {
         let mut buffer = [0; MESSAGES_BYTES];
         while let Some(open) = fd {
             match read_some(open, &mut buffer) {
-                Ok(Heard::Bytes(0)) => return,
-                Ok(Heard::Bytes(bytes)) => {
+                Ok(Incoming::Bytes(0)) => return,
+                Ok(Incoming::Bytes(bytes)) => {
                     text.extend_from_slice(&buffer[..bytes]);
                     text.drain(..text.len().saturating_sub(MESSAGES_BYTES));
                 }
-                Ok(Heard::Over) | Err(_) => *fd = None,
+                Ok(Incoming::Over) | Err(_) => *fd = None,
             }
         }
     }

@@ -34,13 +34,13 @@ pub(crate) struct Budget {
     /// How much the bucket fills in a tick, in 1/1024 ticks.
     share_fine: i64,
     looked: Clock,
-    /// When to look next.
+    /// The time of the next check.
     due: Clock,
-    /// The thread's running time at the last look.
+    /// The thread's running time at the last check.
     ran: Duration,
 }
 
-/// Shortest time between two looks at the thread's running time. Only the kernel knows it, because it also counts the
+/// Shortest time between two checks of the thread's running time. Only the kernel knows it, because it also counts the
 /// way into a sleep and out of it. To ask the kernel costs a system call.
 const LOOK: Ticks = Ticks::from_ms(1);
 
@@ -120,7 +120,7 @@ impl Budget {
     }
 
     /// The thread has moved to another processor and continues as SCHED_FIFO. The bucket of that processor is full. If
-    /// the thread was there before, the bucket has filled again meanwhile.
+    /// the thread was there before, the bucket has filled again since.
     pub(crate) fn moved(&mut self) {
         self.class = Class::Fifo;
         self.level_fine = self.full_fine;

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How long a thread polls for the next step of a conversation before it sleeps.
+//! How long a thread polls for the next job, or for its result, before it sleeps.
 //!
 //! A wake-up takes 20 to 50 us on the computers measured. Most answers of a bus take less. So the core polls for an
 //! answer, and a worker polls for the next question. With a single processor nothing polls, because the other thread
-//! needs that processor. Polling is rationed. So an endless conversation takes no processor from the host. Nor does it
-//! use up the time that the kernel allows real-time threads.
+//! needs that processor. Polling is rationed. So an endless series of jobs takes no processor from the host. Nor does
+//! it use up the time that the kernel allows real-time threads.
 
 #![forbid(unsafe_code)]
 
@@ -21,7 +21,7 @@ const EARNS: i64 = 3;
 pub(crate) struct PollBudget {
     may_poll: bool,
     until: Clock,
-    looked: Clock,
+    polled_at: Clock,
     /// Ticks left for polling.
     ration: i64,
 }
@@ -29,27 +29,27 @@ pub(crate) struct PollBudget {
 impl PollBudget {
     /// Nothing is expected yet. Without `may_poll` the thread never polls.
     pub(crate) fn new(may_poll: bool, now: Clock) -> PollBudget {
-        PollBudget { may_poll, until: now, looked: now, ration: RATION }
+        PollBudget { may_poll, until: now, polled_at: now, ration: RATION }
     }
 
-    /// The next step of the conversation is expected within `span`.
+    /// The next job, or its result, is expected within `span`.
     #[inline]
     pub(crate) fn expect(&mut self, now: Clock, span: Ticks) {
         if self.may_poll {
-            self.ration = (self.ration + now.since(self.looked).max(0) / EARNS).min(RATION);
-            self.looked = now;
+            self.ration = (self.ration + now.since(self.polled_at).max(0) / EARNS).min(RATION);
+            self.polled_at = now;
             self.until = now + span;
         }
     }
 
-    /// Whether to look once more before sleeping.
+    /// Whether to poll once more before sleeping.
     #[inline]
     pub(crate) fn goes_on(&mut self, now: Clock) -> bool {
         if now >= self.until {
             return false;
         }
-        self.ration -= now.since(self.looked).max(0);
-        self.looked = now;
+        self.ration -= now.since(self.polled_at).max(0);
+        self.polled_at = now;
         if self.ration <= 0 {
             self.until = now;
         }
@@ -92,7 +92,7 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// In any second, any conversation polls for at most a quarter of the time and one ration.
+        /// In any second, any series of jobs polls for at most a quarter of the time and one ration.
         #[test]
         fn polling_is_rationed(turns in proptest::collection::vec((0u64..20_000, 1u64..20_000), 1..20)) {
             let mut polling = PollBudget::new(true, Clock::from_ticks(0));

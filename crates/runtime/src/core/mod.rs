@@ -6,6 +6,7 @@
 pub(crate) mod budget;
 pub(crate) mod busy_poll;
 pub(crate) mod heartbeat;
+pub(crate) mod monitors;
 pub(crate) mod responses;
 pub(crate) mod start;
 pub mod wakeup;
@@ -74,7 +75,7 @@ const NEAR: Ticks = Ticks::from_us(5);
 /// Before a timer farther away than this, the core naps. Before a nearer one it needs no heartbeat.
 const FAR_TICKS: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// Work that can wait is done only if no timer is due within this span. To wake the link takes some microseconds. To
-/// tell a part of the status takes one, or several if nothing of it is in the cache.
+/// publish a part of the status takes one, or several if nothing of it is in the cache.
 const SOON: Ticks = Ticks::from_us(30);
 /// Highest number of waiting requests at which a core held by a bus wakes the link for finished blocks. To acknowledge
 /// each block costs as much as to run it.
@@ -215,7 +216,7 @@ impl Core {
             }
             self.record();
             if self.snapshots.is_asked() && !soon(deadline, now) {
-                self.snapshots.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
+                self.snapshots.publish(&self.mcu, self.requests.slots(), self.waiter.margin());
                 continue;
             }
             if self.untold && self.mcu.is_held() && self.requests.slots() <= FEW && !soon(deadline, now) {
@@ -242,7 +243,7 @@ impl Core {
             let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
             // Near a timer, calls have to wait.
             busy_since = match waiter.wait(now, deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
-                // The edge must not wait for another look at the clock.
+                // The edge must not wait for another read of the clock.
                 Woken::Due(now) => {
                     self.mcu.saw(now);
                     self.yielded += 1;
@@ -270,7 +271,7 @@ impl Core {
         self.trace_writer.turn(&mut self.mcu, !self.waiter.is_realtime());
     }
 
-    /// Tells the guardian which output is owed its shutdown value.
+    /// Gives the guardian the name of an output with a pending shutdown value.
     fn tell_pending(&mut self) {
         if !self.mcu.has_pending_values() {
             if self.pending.take().is_some() {

@@ -53,7 +53,7 @@ impl LinkWake {
         }
     }
 
-    /// The link calls this before it sleeps. After this it must look at the rings once more.
+    /// The link calls this before it sleeps. After this it must check the rings once more.
     pub(crate) fn sleeping(&self) {
         self.sleep_flag.begin();
     }
@@ -139,7 +139,7 @@ impl Outbox for ResponseWriter {
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
         head[2..].copy_from_slice(&self.progress.begun().to_le_bytes());
         self.progress.withdraw();
-        // If the host does not read, the ring fills up, and responses are dropped, as in the firmware.
+        // If the host does not read, the ring fills up, and responses are dropped, as in Klipper's C.
         push(&mut self.responses, &head, payload);
         self.wake.wake();
     }

@@ -86,8 +86,7 @@ impl Threads {
         let (jobs, inbox) = RingBuffer::new(QUEUE_JOBS);
         let (outbox, done) = RingBuffer::new(QUEUE_JOBS);
         let quit = Arc::new(AtomicBool::new(false));
-        let shown =
-            self.heartbeat.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
+        let shown = self.heartbeat.worker(bus).ok_or_else(|| overflow(bus, "there are more buses than workers"))?;
         let core = self.core.clone();
         let clock = self.clock.clone();
         let polling = PollBudget::new(self.may_poll, clock.now());

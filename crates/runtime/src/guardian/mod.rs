@@ -28,6 +28,9 @@
 #![forbid(unsafe_code)]
 
 mod message;
+mod outputs;
+mod program;
+mod rescue;
 mod watcher;
 
 use std::io::{self, IoSlice};
@@ -50,13 +53,15 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{monotonic, wait_until};
 use pinion_linux::sys;
 
-use crate::core::heartbeat::{GuardianMonitor, Heartbeat};
+use crate::core::heartbeat::Heartbeat;
+use crate::core::monitors::GuardianMonitor;
 use crate::process::forked::THREADS_MAX;
 use crate::recorder::Recording;
 use crate::trouble::{NO_PROCESS, refused};
 
 use message::{Message, TAKEN};
-use watcher::{END_LIMIT, Program, Watcher};
+use program::{END_LIMIT, Program};
+use watcher::Watcher;
 
 pub(crate) use watcher::NAME;
 #[cfg(fuzzing)]
@@ -245,8 +250,8 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
-    /// A core that continues to run, but owes a shutdown value forever.
-    fn stop_and_owe(heartbeat: Heartbeat) {
+    /// A core that continues to run, with a shutdown value that is pending forever.
+    fn stop_with_pending(heartbeat: Heartbeat) {
         for beats in 0.. {
             if beats == 10 {
                 heartbeat.set_pending("pwmchip7/pwm0", heartbeat.now());
@@ -355,7 +360,7 @@ mod tests {
         match script.as_str() {
             "abort" => std::process::abort(),
             "goodbye" => guardian.goodbye(),
-            "owe" => stop_and_owe(heartbeat),
+            "pending" => stop_with_pending(heartbeat),
             _ => loop {
                 thread::sleep(Duration::from_secs(1));
             },
@@ -417,7 +422,7 @@ mod tests {
 
     #[test]
     fn an_output_that_does_not_get_its_shutdown_value_is_named_and_the_program_killed() {
-        let mut guarded = Guarded::start("owe");
+        let mut guarded = Guarded::start("pending");
         assert_eq!(guarded.signal(), Some(9));
         guarded.wait_for_the_guardian();
         assert_eq!(guarded.output(), "off");

@@ -118,13 +118,13 @@ impl CoreEnd {
         if self.progress.is_held() {
             return;
         }
-        let (mut tells, mut until) = (false, start + AWAIT_CORE);
+        let (mut is_answering, mut until) = (false, start + AWAIT_CORE);
         while done != handed {
             let (now, done_now) = (monotonic(), self.progress.done());
-            let progresses = done_now != done || !tells && self.reader.has_response();
+            let progresses = done_now != done || !is_answering && self.reader.has_response();
             done = done_now;
             if progresses {
-                tells = true;
+                is_answering = true;
                 until = (start + AWAIT_CORE).min(now + AWAIT_MORE);
             }
             if now >= until {

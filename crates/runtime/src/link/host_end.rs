@@ -18,7 +18,7 @@ use pinion_protocol::block::{Received, Receiver, Refusal, SYNC, Sequence, frame}
 
 use crate::core::Payload;
 use crate::status::HostStatus;
-use crate::transport::{Heard, Link, serving};
+use crate::transport::{Input, Transport, serving};
 
 /// The text that a shell writes to a pty to stop the MCU, as in Klipper's service file.
 const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
@@ -29,7 +29,7 @@ const OUTPUT_BYTES: usize = 16 * 1024;
 
 /// A link, with its input and its output.
 pub(crate) struct HostEnd {
-    link: Box<dyn Link>,
+    link: Box<dyn Transport>,
     receiver: Receiver,
     input: Box<[u8; INPUT_BYTES]>,
     /// How many bytes of the input were read.
@@ -73,7 +73,7 @@ pub(crate) enum Next {
 
 impl HostEnd {
     /// The end of a link without a host.
-    pub(crate) fn new(link: Box<dyn Link>, shown: Arc<HostStatus>) -> HostEnd {
+    pub(crate) fn new(link: Box<dyn Transport>, shown: Arc<HostStatus>) -> HostEnd {
         HostEnd {
             silence_max: link.silence_max(),
             link,
@@ -124,7 +124,7 @@ impl HostEnd {
     }
 
     /// Shows whether a host is there, and returns a line about it for the service manager.
-    pub(crate) fn tell(&self) -> String {
+    pub(crate) fn summary(&self) -> String {
         self.shown.attach(self.is_attached);
         self.shown.serve_on(self.link.detail());
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
@@ -135,9 +135,9 @@ impl HostEnd {
     pub(crate) fn read(&mut self, hung_up: bool) -> io::Result<Read> {
         let mut read = Read::default();
         let bytes = match self.link.read(&mut self.input[self.filled..], hung_up)? {
-            Heard::Bytes(bytes) => bytes,
+            Input::Bytes(bytes) => bytes,
             heard => {
-                read.is_over = heard == Heard::Over;
+                read.is_over = heard == Input::Over;
                 read.is_gone = true;
                 self.part();
                 return Ok(read);

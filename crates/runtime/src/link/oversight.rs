@@ -51,17 +51,17 @@ impl Oversight {
         self.vigil.feed(watchdog);
     }
 
-    /// Tells the service manager that a host may come.
+    /// Informs the service manager that a host may come.
     pub(crate) fn ready(&mut self) {
         self.vigil.ready();
     }
 
-    /// Tells the service manager the program's state.
+    /// Informs the service manager about the program's state.
     pub(crate) fn status(&self, status: &str) {
         self.vigil.status(status);
     }
 
-    /// Tells the service manager that the program begins to end.
+    /// Informs the service manager that the program begins to end.
     pub(crate) fn stopping(&self) {
         self.vigil.stopping();
     }
@@ -83,7 +83,7 @@ impl Oversight {
         self.vigil.tick(now);
         let guardian = self.guardian.as_mut()?;
         let hangs = guardian.due().is_some() && guardian.hangs(now);
-        hangs.then_some("the guardian gives no sign of life: was it stopped? (a restart ends it)")
+        hangs.then_some("the guardian has no heartbeat: was it stopped? (a restart ends it)")
     }
 
     /// A descriptor that is readable when a signal has come or the guardian is gone.

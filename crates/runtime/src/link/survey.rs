@@ -26,11 +26,11 @@ pub(crate) fn dialects(
 ) -> Result<Vec<Arc<Dialect>>, Trouble> {
     let made = names.iter().map(|name| Dialect::new(firmware, board, *name).map(Arc::new)).collect::<io::Result<_>>();
     made.map_err(|error| {
-        refused("a host cannot be told what the board has", error).remedy("report it, and restart Pinion")
+        refused("the board's dictionary cannot be made", error).remedy("report it, and restart Pinion")
     })
 }
 
-/// The thread that looks at the board. It opens devices, and the link must not wait for them without an end.
+/// The thread that searches the board. It opens devices, and the link must not wait for them without an end.
 pub(crate) struct Surveyor {
     asks: Sender<()>,
     answers: Receiver<Option<Vec<Arc<Dialect>>>>,
@@ -63,9 +63,9 @@ impl Surveyor {
                     error!("the host gets the board's former names: {trouble}");
                     None
                 });
-                let told = replies.send(found);
+                let sent = replies.send(found);
                 wake.wake();
-                if told.is_err() {
+                if sent.is_err() {
                     return;
                 }
             }

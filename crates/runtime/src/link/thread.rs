@@ -227,7 +227,7 @@ impl LinkThread {
         oversight.end();
     }
 
-    /// Tells the service manager that the program begins to end.
+    /// Informs the service manager that the program begins to end.
     pub(crate) fn stopping(&self) {
         self.oversight.stopping();
     }
@@ -238,10 +238,10 @@ impl LinkThread {
     }
 
     fn tell_status(&self) {
-        self.oversight.status(&self.host.tell());
+        self.oversight.status(&self.host.summary());
     }
 
-    /// Sleeps until there is something to do. `now` may be a little in the past: a look at the clock is not free.
+    /// Sleeps until there is something to do. `now` may be a little in the past: a read of the clock is not free.
     fn wait(&mut self, stalled: bool, now: Duration) -> io::Result<Woken> {
         self.core.wake.sleeping();
         if self.core.has_news() && !self.host.is_full() || self.core.reader.has_line() {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tells the service manager about the program's state: sd_notify(3).
+//! Informs the service manager about the program's state: sd_notify(3).
 
 #![forbid(unsafe_code)]
 
@@ -41,7 +41,7 @@ impl Notify {
             Ok(Notify(Some(socket)))
         };
         connect().map_err(|error: io::Error| {
-            refused(format_args!("the service manager cannot be told anything: NOTIFY_SOCKET {name:?}"), error)
+            refused(format_args!("the service manager cannot be notified: NOTIFY_SOCKET {name:?}"), error)
                 .remedy("let the service see /run/systemd")
         })
     }
@@ -61,8 +61,7 @@ impl Notify {
     }
 }
 
-/// How often the service manager gets a sign of life: at half of its limit (`WatchdogSec=`). `None` if it
-/// sets no limit.
+/// How often the service manager gets a keepalive: at half of its limit (`WatchdogSec=`). `None` if it sets no limit.
 pub(crate) fn watchdog_interval() -> Option<Duration> {
     let variable = |name| env::var(name).ok();
     interval(variable("WATCHDOG_USEC"), variable("WATCHDOG_PID"), std::process::id())

@@ -233,7 +233,7 @@ impl Processors {
     ///
     /// # Errors
     ///
-    /// The process may not use that processor, or there is none of this number.
+    /// The process may not use that processor, or it does not exist.
     pub fn new(core: Option<usize>) -> Result<Processors, Trouble> {
         let unknown = |error: Errno| Trouble::new(error.to_string()).of("the processors of this process");
         let processors = Processors { present: sched_getaffinity(MYSELF).map_err(unknown)?, core };

@@ -146,12 +146,12 @@ impl Vigil {
         self.notify.status(status);
     }
 
-    /// Tells the service manager that the program has started.
+    /// Informs the service manager that the program has started.
     pub(crate) fn ready(&self) {
         self.notify.send("READY=1");
     }
 
-    /// Tells the service manager that the program begins to end.
+    /// Informs the service manager that the program begins to end.
     pub(crate) fn stopping(&self) {
         self.notify.send("STOPPING=1\nSTATUS=shutting down");
     }

@@ -18,13 +18,13 @@ use pinion_linux::{foreign, throttled};
 use pinion_trace::event::{Event, PowerFault, Watched};
 use pinion_trace::ring::Writer;
 
-/// Time between two looks while something happens. The verdict finds a standstill that is somewhat longer.
+/// Time between two samples while something happens. The verdict finds a standstill that is somewhat longer.
 const OFTEN: Duration = Duration::from_millis(250);
-/// Time between two looks while nothing happens. A hang of the core takes a second to be found: looks cover half of it.
+/// Time between two samples while nothing happens. A hang of the core takes a second to be found: samples cover half of it.
 const SELDOM: Duration = Duration::from_millis(500);
-/// After this many looks without anything new, nothing happens. A host asks for the clock each second.
+/// After this many samples without anything new, nothing happens. A host asks for the clock each second.
 const CALM: u32 = 5;
-/// One look in this many is at everything. The kernel needs long for some of it.
+/// One sample in this many reads everything. The kernel needs long for some of it.
 const RARELY: u32 = 32;
 /// Longest file of sysfs or procfs that is read.
 const FILE_BYTES: u64 = 1 << 16;
@@ -36,7 +36,7 @@ pub(super) struct Computer {
     accounts: Vec<Account>,
     /// A Raspberry Pi's file with the firmware's bits.
     throttled: Option<PathBuf>,
-    /// Number of looks so far, and since something happened.
+    /// Number of samples so far, and since something happened.
     looks: u32,
     calm: u32,
     stolen: Option<u64>,
@@ -49,7 +49,7 @@ pub(super) struct Computer {
 struct Account {
     thread: Watched,
     file: File,
-    /// Where the thread writes what it does, and how many events it had at the last look.
+    /// Where the thread writes what it does, and how many events it had at the last sample.
     ring: Ring<'static>,
     written: u64,
     before: Option<Times>,
@@ -85,8 +85,8 @@ impl Computer {
         String::from_utf8(bytes).ok()
     }
 
-    /// Records what has changed since the last call. It looks at most things only if `all`, and at some other calls.
-    /// Returns when to look again.
+    /// Records what has changed since the last call. It reads most things only if `all`, and at some other calls.
+    /// Returns the time of the next sample.
     pub(super) fn look(&mut self, at: Clock, all: bool) -> Duration {
         let all = all || self.looks.is_multiple_of(RARELY);
         self.looks = self.looks.wrapping_add(1);

@@ -114,8 +114,11 @@ impl Recording {
     }
 
     /// Its description for the status.
-    pub(super) fn status(&self) -> form::Recorder {
-        form::Recorder { bytes: self.memory.bytes(), folder: self.folder().map(|folder| folder.display().to_string()) }
+    pub(super) fn status(&self) -> form::RecorderStatus {
+        form::RecorderStatus {
+            bytes: self.memory.bytes(),
+            folder: self.folder().map(|folder| folder.display().to_string()),
+        }
     }
 
     /// The folder of the next file, as far as that is known before.

@@ -99,7 +99,7 @@ impl TraceWriter {
 
     /// The core's thread, which calls this, has started.
     pub(crate) fn start(&mut self) {
-        self.tell(News::Started(gettid()));
+        self.send(News::Started(gettid()));
     }
 
     /// The core has slept.
@@ -147,7 +147,7 @@ impl TraceWriter {
     fn is_later(&mut self, at: Clock, Latest { late, oid }: Latest) {
         self.worst = late;
         if late > LATE {
-            // After a late timer, others that were due meanwhile are late as well.
+            // After a late timer, others that were due during the delay are late as well.
             self.lasting.write(at, Event::Late { oid, late });
         }
     }
@@ -156,7 +156,7 @@ impl TraceWriter {
     fn pace(&mut self, at: Clock) {
         let worst = std::mem::take(&mut self.worst);
         self.pace_at = at + PACE;
-        // Each timer is a little late. Without one, nothing is written: the recorder looks less often at a calm core.
+        // Each timer is a little late. Without one, nothing is written: the recorder samples a calm core less often.
         if worst.0 > 0 {
             self.lasting.write(at, Event::Pace { worst });
         }
@@ -176,7 +176,7 @@ impl TraceWriter {
             let configured = state.is(State::CONFIGURED);
             self.lasting.write(at, if configured { Event::Configured } else { Event::Reset });
             if configured {
-                self.tell(News::Configured(mcu.object_names()));
+                self.send(News::Configured(mcu.object_names()));
             }
         }
         if changed.is(State::STOPPED)
@@ -187,11 +187,11 @@ impl TraceWriter {
                 self.lasting.write(stopped_at, Event::Due(due));
             }
             let (reason, trouble) = (stop.reason.text(), stop.trouble.to_string());
-            self.tell(News::Stopped { at: stopped_at, reason, trouble });
+            self.send(News::Stopped { at: stopped_at, reason, trouble });
         }
     }
 
-    fn tell(&mut self, news: News) {
+    fn send(&mut self, news: News) {
         // News without room are dropped: the recorder has enough to write.
         if self.news.push(news).is_ok() {
             let _ = self.wake.write(1);

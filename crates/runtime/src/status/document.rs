@@ -90,7 +90,7 @@ pub(crate) struct Facts {
     /// How many requests to the core there is room for.
     pub(crate) requests: usize,
     /// The flight recorder.
-    pub(crate) recorder: form::Recorder,
+    pub(crate) recorder: form::RecorderStatus,
 }
 
 /// Writes the status.

@@ -39,7 +39,7 @@ pub struct Status {
     pub guardian: Guardian,
     /// The flight recorder. An older Pinion has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub recorder: Option<Recorder>,
+    pub recorder: Option<RecorderStatus>,
     /// `None` if the core has not answered in time. Then `state` is [`State::Unknown`].
     #[serde(flatten)]
     pub mcu: Option<McuStatus>,
@@ -47,7 +47,7 @@ pub struct Status {
 
 /// The flight recorder.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Recorder {
+pub struct RecorderStatus {
     /// Highest number of bytes of memory that it takes.
     pub bytes: usize,
     /// The folder that takes the traces; `None` if none are kept.
@@ -133,7 +133,7 @@ pub struct McuStatus {
 /// Why and when the MCU shut down.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Stop {
-    /// The firmware's text, which the host gets.
+    /// Klipper's text, which the host gets.
     pub reason: String,
     /// Cause and remedy, as the log has them.
     pub detail: String,
@@ -314,10 +314,10 @@ fn list_unknown(sent: &Value, known: &Value, path: &str, unknown: &mut Vec<Strin
         (Value::Array(sent), Value::Array(known)) => {
             let before = unknown.len();
             sent.iter().zip(known).for_each(|(sent, known)| list_unknown(sent, known, path, unknown));
-            let mut told = unknown.split_off(before);
-            told.sort();
-            told.dedup();
-            unknown.append(&mut told);
+            let mut unshown = unknown.split_off(before);
+            unshown.sort();
+            unshown.dedup();
+            unknown.append(&mut unshown);
         }
         _ => {}
     }

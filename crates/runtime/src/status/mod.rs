@@ -4,7 +4,7 @@
 //! A thread of its own serves the socket (`socket.rs`). It sends one JSON document (`form.rs`) to each client and
 //! reads nothing. For the MCU's part it sends the core an empty [`Snapshot`] through a ring. It looks for its return
 //! every few milliseconds. The core is not woken. It fills in the snapshot when it next passes by with no timer near.
-//! So an answer may take as long as the core's nap. It costs the core one look at the ring each time that it is idle
+//! So an answer may take as long as the core's nap. It costs the core one check of the ring each time that it is idle
 //! anyway.
 
 #![forbid(unsafe_code)]
@@ -28,7 +28,7 @@ pub use socket::{socket_paths, trace_socket_paths};
 
 /// Longest wait for the core's answer. It is longer than the core's longest nap.
 const ANSWER_WAIT_MAX: Duration = Duration::from_millis(1000);
-/// Time between two looks for the answer.
+/// Time between two checks for the answer.
 const LOOK: Duration = Duration::from_millis(2);
 
 /// The core's own figures, sent with the MCU's snapshot.
@@ -44,7 +44,7 @@ struct Answer {
 /// The core's end.
 pub(super) struct SnapshotWriter {
     asked: Consumer<Box<Answer>>,
-    told: Producer<Box<Answer>>,
+    answered: Producer<Box<Answer>>,
     /// The answer that is being filled in.
     at_work: Option<Box<Answer>>,
 }
@@ -60,8 +60,8 @@ pub(super) struct SnapshotReader {
 /// Makes both ends.
 pub(super) fn ends() -> (SnapshotWriter, SnapshotReader) {
     let (ask, asked) = RingBuffer::new(1);
-    let (told, answers) = RingBuffer::new(1);
-    (SnapshotWriter { asked, told, at_work: None }, SnapshotReader { ask, answers, spare: Some(Box::default()) })
+    let (answered, answers) = RingBuffer::new(1);
+    (SnapshotWriter { asked, answered, at_work: None }, SnapshotReader { ask, answers, spare: Some(Box::default()) })
 }
 
 impl SnapshotWriter {
@@ -74,12 +74,12 @@ impl SnapshotWriter {
     /// Fills in the next part of the answer. Call it while no timer is near. `waiting` is how many requests wait for
     /// the core. `margin` is how early the core wakes for a timer.
     #[cold]
-    pub(super) fn tell(&mut self, mcu: &Mcu, waiting: usize, margin: Ticks) {
+    pub(super) fn publish(&mut self, mcu: &Mcu, waiting: usize, margin: Ticks) {
         let Some(mut answer) = self.at_work.take().or_else(|| self.asked.pop().ok()) else { return };
         if mcu.fill(&mut answer.mcu) {
             (answer.waiting, answer.margin) = (waiting, margin);
             // There is room: at most one answer is under way.
-            let _ = self.told.push(answer);
+            let _ = self.answered.push(answer);
         } else {
             self.at_work = Some(answer);
         }

@@ -291,7 +291,7 @@ mod tests {
             view: None,
             guardian: None,
             requests: 256,
-            recorder: form::Recorder { bytes: 0, folder: None },
+            recorder: form::RecorderStatus { bytes: 0, folder: None },
         }
     }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The ways between a host and the MCU, in a file each. What they share is [`Link`].
+//! The ways between a host and the MCU, in a file each. Each implements [`Transport`].
 
 #![forbid(unsafe_code)]
 
@@ -35,9 +35,9 @@ const GADGET: &str = "ttyGS";
 
 /// A way to the host, open or about to be opened again.
 ///
-/// The thread that serves the host waits for [`Link::event`] or [`Link::due`], whichever is first. It then calls
-/// [`Link::read`].
-pub(crate) trait Link {
+/// The thread that serves the host waits for [`Transport::event`] or [`Transport::due`], whichever is first. It then calls
+/// [`Transport::read`].
+pub(crate) trait Transport {
     /// Where the host finds the MCU, for example a path.
     fn place(&self) -> String;
 
@@ -68,7 +68,7 @@ pub(crate) trait Link {
     /// # Errors
     ///
     /// The link does not work any more.
-    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard>;
+    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Input>;
 
     /// Writes as many bytes as there is room for. Returns how many.
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize>;
@@ -100,7 +100,7 @@ pub(crate) fn serving(is_open: bool) -> &'static str {
 
 /// The result of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Heard {
+pub(crate) enum Input {
     /// This many bytes came, or none.
     Bytes(usize),
     /// The host is gone.
@@ -133,7 +133,7 @@ impl LinkName {
     /// # Errors
     ///
     /// The path is taken, the port is another program's or not there, or the kernel refuses it.
-    pub(crate) fn open(&self, access: &Access) -> Result<Box<dyn Link>, Trouble> {
+    pub(crate) fn open(&self, access: &Access) -> Result<Box<dyn Transport>, Trouble> {
         Ok(match self {
             LinkName::Pty(path) => Box::new(Pty::open(path, access)?),
             LinkName::Serial(path, baud) => Box::new(SerialLine::open(path, *baud)?),

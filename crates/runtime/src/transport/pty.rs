@@ -23,7 +23,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
-use super::{Heard, Link};
+use super::{Input, Transport};
 use crate::transport::place::Place;
 use crate::transport::served::served;
 use crate::transport::terminal_group::{CLOSED, TerminalGroup};
@@ -38,7 +38,7 @@ const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
 const RESTORE_EVERY: Duration = Duration::from_secs(1);
 /// How long to wait for another program that serves a link in the same folder. Everybody may lock that folder.
 const TURN_MAX: Duration = Duration::from_secs(3);
-/// How often to look for the end of that program's turn.
+/// How often to check if that program's turn has ended.
 const TURN_LOOK: Duration = Duration::from_millis(10);
 
 /// A terminal that a host finds by a symbolic link.
@@ -188,7 +188,7 @@ fn turn(symlink: &Path) -> Option<Flock<File>> {
     }
 }
 
-impl Link for Pty {
+impl Transport for Pty {
     fn place(&self) -> String {
         self.symlink.display().to_string()
     }
@@ -210,16 +210,16 @@ impl Link for Pty {
         self.restore_at
     }
 
-    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard> {
+    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Input> {
         if !hung_up {
             self.restore();
         }
         match read(&self.master, buffer) {
             // A host that stops the MCU and closes the terminal has been heard, even if this thread comes late.
-            Ok(len) if len > 0 || !hung_up => Ok(Heard::Bytes(len)),
+            Ok(len) if len > 0 || !hung_up => Ok(Input::Bytes(len)),
             // The kernel answers EIO when the host has gone and all its bytes have been read.
-            Ok(_) | Err(Errno::EIO) if hung_up => Ok(Heard::Gone),
-            Ok(_) | Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Heard::Bytes(0)),
+            Ok(_) | Err(Errno::EIO) if hung_up => Ok(Input::Gone),
+            Ok(_) | Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Input::Bytes(0)),
             Err(error) => Err(error.into()),
         }
     }
@@ -393,11 +393,11 @@ mod tests {
         let mut bytes = [0; 3];
         // The kernel moves the bytes after the hang-up, too.
         while !hangs_up(&pty) {}
-        for (heard, text) in [(Heard::Bytes(3), "sto"), (Heard::Bytes(1), "p")] {
+        for (heard, text) in [(Input::Bytes(3), "sto"), (Input::Bytes(1), "p")] {
             assert_eq!(pty.read(&mut bytes, true).unwrap(), heard);
             assert!(bytes.starts_with(text.as_bytes()));
         }
-        assert_eq!(pty.read(&mut bytes, true).unwrap(), Heard::Gone);
+        assert_eq!(pty.read(&mut bytes, true).unwrap(), Input::Gone);
         pty.part_from_host();
         assert!(!hangs_up(&pty));
     }
@@ -449,7 +449,7 @@ mod tests {
         open().write_all(b"FORCE_SHUTDOWN\n").unwrap();
         assert!(!pty.meet_host());
         let mut heard = [0; 64];
-        let Heard::Bytes(len) = pty.read(&mut heard, false).unwrap() else { panic!() };
+        let Input::Bytes(len) = pty.read(&mut heard, false).unwrap() else { panic!() };
         assert_eq!(heard[..len], *b"FORCE_SHUTDOWN\n");
         assert!(!hangs_up(&pty));
     }
@@ -463,10 +463,10 @@ mod tests {
         pty.write(b"for the last one").unwrap();
         drop(host);
         let mut heard = [0; 64];
-        assert_eq!(pty.read(&mut heard, false).unwrap(), Heard::Bytes(1));
+        assert_eq!(pty.read(&mut heard, false).unwrap(), Input::Bytes(1));
         assert_eq!(
             pty.read(&mut heard, false).unwrap(),
-            Heard::Bytes(0),
+            Input::Bytes(0),
             "a terminal that hung up has nothing to read"
         );
         pty.part_from_host();

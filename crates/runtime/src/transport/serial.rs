@@ -21,7 +21,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 use pinion_linux::uart;
 
-use super::{Heard, Link};
+use super::{Input, Transport};
 
 /// How long to wait before a port that is gone is opened again.
 const REOPEN: Duration = Duration::from_secs(1);
@@ -34,9 +34,9 @@ pub(crate) struct SerialLine {
 }
 
 enum State {
-    /// No other program may open it meanwhile.
+    /// No other program may open it while it is in use.
     Open(Flock<File>),
-    /// It is gone. When to look for it.
+    /// It is gone. The time of the next try.
     Gone(Duration),
 }
 
@@ -55,17 +55,17 @@ impl SerialLine {
         Ok(SerialLine { path: path.to_owned(), baud, state })
     }
 
-    fn lose(&mut self) -> Heard {
+    fn lose(&mut self) -> Input {
         warn!(
             "{} is gone, and the host with it: plug it in again (Pinion opens it when it is there)",
             self.path.display()
         );
         self.state = State::Gone(monotonic() + REOPEN);
-        Heard::Gone
+        Input::Gone
     }
 }
 
-impl Link for SerialLine {
+impl Transport for SerialLine {
     fn place(&self) -> String {
         self.path.display().to_string()
     }
@@ -92,7 +92,7 @@ impl Link for SerialLine {
         }
     }
 
-    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard> {
+    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Input> {
         match &self.state {
             State::Gone(until) if monotonic() < *until => {}
             State::Gone(_) => match uart::open_line(&self.path, self.baud) {
@@ -105,12 +105,12 @@ impl Link for SerialLine {
             State::Open(_) if hung_up => return Ok(self.lose()),
             State::Open(file) => match read(file.as_fd(), buffer) {
                 Ok(0) if !buffer.is_empty() => return Ok(self.lose()),
-                Ok(len) => return Ok(Heard::Bytes(len)),
+                Ok(len) => return Ok(Input::Bytes(len)),
                 Err(Errno::EAGAIN | Errno::EINTR) => {}
                 Err(_) => return Ok(self.lose()),
             },
         }
-        Ok(Heard::Bytes(0))
+        Ok(Input::Bytes(0))
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {

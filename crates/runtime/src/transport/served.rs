@@ -30,7 +30,7 @@ const PROGRAMS: [(&str, &str); 3] =
 pub struct Served {
     link: PathBuf,
     device: PathBuf,
-    /// The program's name for people. `None` if it is none that serves hosts.
+    /// The program's name for people. `None` for a program that does not serve hosts.
     program: Option<&'static str>,
     pid: Option<u32>,
     unit: Option<String>,

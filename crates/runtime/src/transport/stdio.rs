@@ -20,7 +20,7 @@ use signal_hook::low_level::emulate_default_handler;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
-use super::{Heard, Link};
+use super::{Input, Transport};
 use crate::process::signals;
 use crate::trouble::{refused, started};
 
@@ -159,7 +159,7 @@ fn shows_log(fd: impl AsFd + IsTerminal) -> bool {
     fd.is_terminal() && log.is_terminal() && device(fd.as_fd()) == device(log.as_fd())
 }
 
-impl Link for Stdio {
+impl Transport for Stdio {
     fn place(&self) -> String {
         "standard input".into()
     }
@@ -176,16 +176,16 @@ impl Link for Stdio {
         self.full_until
     }
 
-    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Input> {
         // The pause is over, even if there is nothing to write any more.
         self.full_until = None;
         // There may be bytes before the end.
         match read(&self.input, buffer) {
-            Ok(0) if !buffer.is_empty() => Ok(Heard::Over),
-            Ok(len) => Ok(Heard::Bytes(len)),
-            Err(Errno::EAGAIN | Errno::EINTR) => Ok(Heard::Bytes(0)),
+            Ok(0) if !buffer.is_empty() => Ok(Input::Over),
+            Ok(len) => Ok(Input::Bytes(len)),
+            Err(Errno::EAGAIN | Errno::EINTR) => Ok(Input::Bytes(0)),
             // A terminal or a socket whose other end is gone.
-            Err(Errno::EIO | Errno::ECONNRESET) => Ok(Heard::Over),
+            Err(Errno::EIO | Errno::ECONNRESET) => Ok(Input::Over),
             Err(error) => Err(error.into()),
         }
     }

@@ -4,13 +4,13 @@
 #![forbid(unsafe_code)]
 
 use super::evidence::{Job, MS, Record, Span};
-use super::{Culprit, Finding, span_text};
+use super::{Culprit, Judgment, span_text};
 
-/// Shortest job under way that is worth telling while the program works.
+/// Shortest job under way that a verdict names while the program works.
 const HANGS: i64 = 1000 * MS;
 
 /// A command waited for a bus for half of this span.
-pub(super) fn of_bus(record: &Record, span: Span) -> Option<Finding> {
+pub(super) fn of_bus(record: &Record, span: Span) -> Option<Judgment> {
     let held = record.held(span);
     if held * 2 < span.1 - span.0 {
         return None;
@@ -28,17 +28,17 @@ pub(super) fn of_bus(record: &Record, span: Span) -> Option<Finding> {
         }
         None => format!("the host's commands waited {} for a bus", span_text(held)),
     };
-    Some(Finding::new(Culprit::Bus, what, "use a higher rate, or another bus for the device"))
+    Some(Judgment::new(Culprit::Bus, what, "use a higher rate, or another bus for the device"))
 }
 
 /// A bus hangs.
-pub(super) fn of_hanging(record: &Record) -> Option<Finding> {
+pub(super) fn of_hanging(record: &Record) -> Option<Judgment> {
     record.hanging().filter(|job| -job.span.0 > HANGS).map(|job| hanging(record, &job))
 }
 
-fn hanging(record: &Record, job: &Job) -> Finding {
+fn hanging(record: &Record, job: &Job) -> Judgment {
     let what = format!("{} has not answered for {}{}", job.bus, span_text(-job.span.0), sender(record, job.oid));
-    Finding::new(Culprit::Bus, what, "check the power and the wires of its devices, and dmesg")
+    Judgment::new(Culprit::Bus, what, "check the power and the wires of its devices, and dmesg")
 }
 
 /// The sender of a job, as a clause behind others.

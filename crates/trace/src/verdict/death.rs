@@ -6,10 +6,10 @@
 use super::bus::of_hanging;
 use super::evidence::Record;
 use super::processors::of_core;
-use super::{Culprit, Finding, SILENT, span_text};
+use super::{Culprit, Judgment, SILENT, span_text};
 
 /// The program is gone.
-pub(super) fn died(record: &Record) -> Finding {
+pub(super) fn died(record: &Record) -> Judgment {
     let last = record.last_of_core();
     let what = match last {
         Some(last) => {
@@ -17,21 +17,21 @@ pub(super) fn died(record: &Record) -> Finding {
         }
         None => "Pinion died".to_owned(),
     };
-    Finding::new(Culprit::Death, what, "look for a panic in its log, and for who killed it (dmesg: out of memory)")
+    Judgment::new(Culprit::Death, what, "look for a panic in its log, and for who killed it (dmesg: out of memory)")
 }
 
-/// The guardian killed a program that gave no sign of life.
-pub(super) fn hung(record: &Record, diagnosis: &str) -> Finding {
+/// The guardian killed a program that had no heartbeat.
+pub(super) fn hung(record: &Record, diagnosis: &str) -> Judgment {
     // Without a silent core, an output is not at its shutdown value.
     let silent = record.last_of_core().filter(|last| -last > SILENT);
     let found = of_hanging(record).or_else(|| of_core(record, (silent?, 0)));
     if let Some(finding) = found {
-        return Finding { what: format!("Pinion hung: {}", finding.what), ..finding };
+        return Judgment { what: format!("Pinion hung: {}", finding.what), ..finding };
     }
     let last = silent.map_or_else(String::new, |last| {
         format!("; the core's last event was {} before{}", span_text(-last), doing(record))
     });
-    Finding::new(Culprit::Death, format!("Pinion hung: {diagnosis}{last}"), "report it with its log")
+    Judgment::new(Culprit::Death, format!("Pinion hung: {diagnosis}{last}"), "report it with its log")
 }
 
 /// The core's last command, as a clause behind others.

@@ -13,7 +13,7 @@ use crate::file::Trace;
 pub(super) use crate::history::TICKS_PER_MS as MS;
 use crate::ring::WINDOW;
 
-/// How late the sampler may look while nothing is wrong.
+/// How late a sample may be while nothing is wrong.
 const LOOK_LATE: i64 = 100 * MS;
 /// Longest time between two signs of the guardian, and a little more.
 const LISTENS: i64 = 700 * MS;
@@ -172,7 +172,7 @@ impl<'a> Record<'a> {
         heard.rfind(|(_, event)| is_heard(event)).map(|(at, _)| at)
     }
 
-    /// Whether the host's computer gave a sign of life in a span, for a host that was silent.
+    /// Whether the host's computer sent a keepalive in a span, for a host that was silent.
     pub(super) fn was_alive(&self, span: Span) -> bool {
         self.within(Thread::Link, span).any(|(_, event)| event == Event::Alive)
     }
@@ -362,7 +362,7 @@ impl<'a> Record<'a> {
             .any(|(at, thread, _)| inner.contains(at) && !matches!(thread, Thread::Core | Thread::Guardian))
     }
 
-    /// Whether the sampler missed its time in a span, because it did not run either. It says when it looks again.
+    /// Whether the sampler missed its time in a span, because it did not run either. It says when its next sample is due.
     pub(super) fn sampler_missed(&self, span: Span) -> bool {
         // It may have been the last one to stop.
         let start = span.0 + (span.1 - span.0) / 8;
@@ -414,7 +414,7 @@ impl<'a> Record<'a> {
         timers.max_by_key(|(at, late)| (*late, -at))
     }
 
-    /// How late a timer was at most within a span, by its own time.
+    /// How late a timer was at most within a span, measured from its due time.
     pub(super) fn latest_within(&self, span: Span) -> i64 {
         let late = self
             .within(Thread::Core, span)

@@ -9,33 +9,33 @@ use super::bus::of_bus;
 use super::evidence::{Arrival, MS, Record, Span};
 use super::power::with_power;
 use super::processors::{of_core, of_link};
-use super::{Culprit, Finding, PROMPT, SILENT, on_time, span_text};
+use super::{Culprit, Judgment, PROMPT, SILENT, on_time, span_text};
 
 /// How long a host may take to send the next block after an acknowledgement.
 const REACTION: i64 = 20 * MS;
-/// Shortest time without commands of a host that is worth telling.
+/// Shortest time without commands of a host that a verdict names.
 const SILENCE: i64 = 1500 * MS;
-/// Shortest time without a sign of life of a silent host's computer that is worth telling.
+/// Shortest time without a keepalive of a silent host's computer that a verdict names.
 const SIGN: i64 = 2500 * MS;
 
 /// The program's input has ended.
-pub(super) fn host_lost(record: &Record) -> Finding {
+pub(super) fn host_lost(record: &Record) -> Judgment {
     let silent = record.last_heard(0).map_or(0, |at| -at);
     let what = match silent {
         SILENCE.. => format!("nothing came over standard input for {}, and then it ended", span_text(silent)),
         _ => "the program that carries the host's bytes closed standard input".to_owned(),
     };
-    Finding::new(Culprit::Wire, what + &on_time(record), "look at its log, and at the network")
+    Judgment::new(Culprit::Wire, what + &on_time(record), "look at its log, and at the network")
 }
 
 /// The host asked for an event whose time had passed.
-pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
+pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Judgment {
     let in_time = |came: i64| came - due <= -PROMPT;
     let came = record.stop.block.and_then(|block| record.arrived(block));
     // A time that is not the block's own proves only that the block came in time.
     let Some(Arrival { at: came, .. }) = came.filter(|came| came.is_exact || in_time(came.at)) else {
         let what = format!("an event was asked for {} after its time", span_text(-due));
-        let unknown = Finding::new(Culprit::Unknown, format!("{what}; not known when its block came"), "");
+        let unknown = Judgment::new(Culprit::Unknown, format!("{what}; not known when its block came"), "");
         return of_core(record, (due, 0)).unwrap_or(unknown);
     };
     let late = came - due;
@@ -49,7 +49,7 @@ pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
                 span_text(-late),
                 span_text(-due)
             );
-            Finding::new(Culprit::Unknown, what, "")
+            Judgment::new(Culprit::Unknown, what, "")
         });
     }
     if late > 0 {
@@ -69,7 +69,7 @@ pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
             span_text(late),
             on_time(record)
         );
-        return with_power(record, (heard, 0), Finding::new(Culprit::Wire, what, wire_remedy(wire)));
+        return with_power(record, (heard, 0), Judgment::new(Culprit::Wire, what, wire_remedy(wire)));
     }
     let mut what = match late {
         0.. => format!("the host's block came {} after the {event} it was for", span_text(late)),
@@ -81,7 +81,7 @@ pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
         Some(wire) => format!("look at the host's load, and at the wire ({wire})"),
         None => "look at the host's load".to_owned(),
     };
-    with_power(record, (due, 0), Finding::new(Culprit::Host, what, remedy))
+    with_power(record, (due, 0), Judgment::new(Culprit::Host, what, remedy))
 }
 
 fn wire_remedy(wire: &str) -> &'static str {
@@ -92,7 +92,7 @@ fn wire_remedy(wire: &str) -> &'static str {
 }
 
 /// The host did not refresh an output before `due`.
-pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
+pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Judgment {
     // A block may have come in time and wait.
     if let Some(came) = record.pending().filter(|came| *came < due - PROMPT) {
         let found = of_bus(record, (came, 0)).or_else(|| of_core(record, (came, 0)));
@@ -104,19 +104,19 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding
     if let Some(gone) = record.host_gone() {
         let before = span_text(-gone);
         return match wire {
-            Some(wire) => Finding::new(
+            Some(wire) => Judgment::new(
                 Culprit::Wire,
                 format!("the host was gone from {wire} {before} before the stop"),
                 wire_remedy(wire),
             ),
             None => {
                 let what = format!("the host closed the terminal {before} before the stop");
-                Finding::new(Culprit::Host, what, "its log tells why it ended")
+                Judgment::new(Culprit::Host, what, "its log says why it ended")
             }
         };
     }
     let Some(before) = record.last_block() else {
-        return Finding::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
+        return Judgment::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
     };
     // The host waits for an acknowledgement.
     if -before > SILENT
@@ -130,7 +130,7 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding
             span_text(-before),
             on_time(record)
         );
-        return with_power(record, (before, 0), Finding::new(Culprit::Host, what, ""));
+        return with_power(record, (before, 0), Judgment::new(Culprit::Host, what, ""));
     }
     if let Some(finding) = of_link(record, (before, 0)) {
         return finding;
@@ -139,20 +139,20 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding
     let signs = record.signs_of_host(span);
     let heard = record.last_heard(0).unwrap_or(before);
     let was_alive = record.was_alive((heard, 0));
-    // While its host says nothing, `pinion link` gives a sign of life every two seconds.
+    // While its host says nothing, `pinion link` sends a keepalive every two seconds.
     let longest = if was_alive { SIGN } else { SILENCE };
     if let Some(wire) = wire.filter(|_| -heard > longest) {
         let came = if record.has_garbage((heard, 0)) { "only garbage" } else { "nothing" };
         let what = format!("{came} came over {wire} for {}{}", span_text(-heard), on_time(record));
-        return with_power(record, (before, 0), Finding::new(Culprit::Wire, what, wire_remedy(wire)));
+        return with_power(record, (before, 0), Judgment::new(Culprit::Wire, what, wire_remedy(wire)));
     }
     let alive = match signs {
         (0, true) => ", but it still asked for the clock".to_owned(),
-        (0, false) if was_alive => ", but its computer gave a sign of life".to_owned(),
+        (0, false) if was_alive => ", but its computer sent keepalives".to_owned(),
         _ => resent(record, (before, 0)),
     };
     let what = format!("the host sent no commands for {}{alive}{}", span_text(-before), on_time(record));
-    with_power(record, (before, 0), Finding::new(Culprit::Host, what, "look at its log, and at its load"))
+    with_power(record, (before, 0), Judgment::new(Culprit::Host, what, "look at its log, and at its load"))
 }
 
 /// How often the host sent again what it had sent, as a clause behind others.

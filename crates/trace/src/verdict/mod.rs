@@ -15,7 +15,6 @@ use death::{died, hung};
 use evidence::{MS, Record};
 use host::{host_lost, not_refreshed, too_close};
 use processors::{late_step, of_core};
-use standstill::stood_still;
 
 use super::file::{End, Trace};
 
@@ -75,21 +74,21 @@ pub struct Verdict {
 }
 
 /// A verdict in the making.
-struct Finding {
+struct Judgment {
     culprit: Culprit,
     what: String,
     remedy: String,
 }
 
-impl Finding {
-    fn new(culprit: Culprit, what: impl Into<String>, remedy: impl Into<String>) -> Finding {
-        Finding { culprit, what: what.into(), remedy: remedy.into() }
+impl Judgment {
+    fn new(culprit: Culprit, what: impl Into<String>, remedy: impl Into<String>) -> Judgment {
+        Judgment { culprit, what: what.into(), remedy: remedy.into() }
     }
 }
 /// Judges a trace.
 pub fn verdict(trace: &Trace) -> Verdict {
     let record = Record::of(trace, matches!(trace.head.end, End::Shutdown { .. }));
-    let Finding { culprit, what, remedy } = match &trace.head.end {
+    let Judgment { culprit, what, remedy } = match &trace.head.end {
         End::Shutdown { reason, trouble } => stopped(&record, reason, trouble),
         End::Died => died(&record),
         End::Hung { diagnosis } => hung(&record, diagnosis),
@@ -98,11 +97,19 @@ pub fn verdict(trace: &Trace) -> Verdict {
     Verdict { culprit, text: if remedy.is_empty() { what } else { format!("{what}: {remedy}") } }
 }
 
+/// The core noticed that it gave no beat for a second or more, or that the computer was suspended.
+fn stood_still(record: &Record, trouble: &str) -> Judgment {
+    let gap = record.gap((record.first_of_core().unwrap_or(0).min(0), 0));
+    // The clock of the events stands still while the computer is suspended.
+    let found = if gap.1 - gap.0 > SILENT && gap.1 > -PROMPT { of_core(record, gap) } else { None };
+    found.unwrap_or_else(|| Judgment::new(Culprit::Standstill, format!("everything stood still: {trouble}"), ""))
+}
+
 /// Why the MCU stopped.
-fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
+fn stopped(record: &Record, text: &str, trouble: &str) -> Judgment {
     if text == reason::BUS_HANGS.text() {
         return of_hanging(record)
-            .unwrap_or_else(|| Finding::new(Culprit::Bus, format!("a bus did not answer: {trouble}"), ""));
+            .unwrap_or_else(|| Judgment::new(Culprit::Bus, format!("a bus did not answer: {trouble}"), ""));
     }
     if text == reason::HOST_LOST.text() {
         return host_lost(record);
@@ -111,7 +118,7 @@ fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
         return match text {
             _ if text == reason::TIMER_PAST.text() => stood_still(record, trouble),
             _ if text == reason::TIMER_TOO_CLOSE.text() || text.starts_with(MISSED) => {
-                Finding::new(Culprit::Unknown, format!("not known who was late: {trouble}"), "")
+                Judgment::new(Culprit::Unknown, format!("not known who was late: {trouble}"), "")
             }
             _ => other_reason(record, trouble),
         };
@@ -126,31 +133,31 @@ fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
 }
 
 /// A stop that was not about a time.
-fn other_reason(record: &Record, trouble: &str) -> Finding {
+fn other_reason(record: &Record, trouble: &str) -> Judgment {
     match record.latest_timer().filter(|(_, late)| *late >= VERY_LATE) {
         Some((at, late)) => {
             let what = of_core(record, (at - late, at))
                 .map_or_else(|| format!("a timer was {} late", span_text(late)), |finding| finding.what);
             let before = span_text((-at).max(0));
-            Finding::new(Culprit::Nobody, format!("{trouble}; {before} before, {what}, which did not stop it"), "")
+            Judgment::new(Culprit::Nobody, format!("{trouble}; {before} before, {what}, which did not stop it"), "")
         }
-        None => Finding::new(Culprit::Nobody, format!("nobody was late: {trouble}"), ""),
+        None => Judgment::new(Culprit::Nobody, format!("nobody was late: {trouble}"), ""),
     }
 }
 
 /// The recording of a program that works.
-fn asked(record: &Record) -> Finding {
+fn asked(record: &Record) -> Judgment {
     if let Some(finding) = of_hanging(record) {
         return finding;
     }
     let Some((at, late)) = record.latest_timer() else {
-        return Finding::new(Culprit::Unknown, "no timer is in the recording: nobody can have been late", "");
+        return Judgment::new(Culprit::Unknown, "no timer is in the recording: nobody can have been late", "");
     };
     if late < LATE {
-        return Finding::new(Culprit::Nobody, format!("nobody was late{}", on_time(record)), "");
+        return Judgment::new(Culprit::Nobody, format!("nobody was late{}", on_time(record)), "");
     }
     let mut finding = of_core(record, (at - late, at)).unwrap_or_else(|| {
-        Finding::new(Culprit::Unknown, format!("not known why a timer was {} late", span_text(late)), "")
+        Judgment::new(Culprit::Unknown, format!("not known why a timer was {} late", span_text(late)), "")
     });
     finding.what += &format!(" ({} before the end of the recording)", span_text((-at).max(0)));
     finding

@@ -6,10 +6,10 @@
 use crate::event::PowerFault;
 
 use super::evidence::{Record, Span};
-use super::{Culprit, Finding};
+use super::{Culprit, Judgment};
 
 /// The same finding, if the computer's power was good in that span. Otherwise the power comes first.
-pub(super) fn with_power(record: &Record, span: Span, finding: Finding) -> Finding {
+pub(super) fn with_power(record: &Record, span: Span, finding: Judgment) -> Judgment {
     let (what, remedy) = match record.power_fault(span) {
         Some(PowerFault::Undervoltage) => {
             ("the power supply's voltage was too low", "use a better power supply and a short, thick cable")
@@ -18,10 +18,10 @@ pub(super) fn with_power(record: &Record, span: Span, finding: Finding) -> Findi
         None => match record.low_frequency(span) {
             Some((mhz, max)) if matches!(finding.culprit, Culprit::Work | Culprit::Driver) => {
                 let what = format!("{}, at {mhz} MHz of {max} MHz", finding.what);
-                return Finding::new(Culprit::Power, what, "set the frequency governor to performance");
+                return Judgment::new(Culprit::Power, what, "set the frequency governor to performance");
             }
             _ => return finding,
         },
     };
-    Finding::new(Culprit::Power, format!("{what} then; {}", finding.what), remedy)
+    Judgment::new(Culprit::Power, format!("{what} then; {}", finding.what), remedy)
 }

@@ -8,7 +8,7 @@ use crate::event::Watched;
 use super::evidence::{MS, QUIET, Record, Scheduling, Span};
 use super::power::with_power;
 use super::standstill::standstill;
-use super::{Culprit, Finding, PROMPT, on_time, span_text};
+use super::{Culprit, Judgment, PROMPT, on_time, span_text};
 
 /// Fewest events of a core that works all the time.
 const FLOOD: usize = 4;
@@ -18,7 +18,7 @@ const ASLEEP: i64 = 300 * MS;
 const LOST: i64 = 5 * MS;
 
 /// A timer ran so long after `due` that the MCU stopped.
-pub(super) fn late_step(record: &Record, due: i64, trouble: &str) -> Finding {
+pub(super) fn late_step(record: &Record, due: i64, trouble: &str) -> Judgment {
     let span = (due, 0);
     if let Some(finding) = of_core(record, span) {
         return finding;
@@ -27,15 +27,15 @@ pub(super) fn late_step(record: &Record, due: i64, trouble: &str) -> Finding {
         // Each of its steps waited for the pulse of the one before.
         Some((_, worst)) if worst < -due / 2 => {
             let what = format!("steps were closer together than their pulses{}: {trouble}", on_time(record));
-            return Finding::new(Culprit::Work, what, "");
+            return Judgment::new(Culprit::Work, what, "");
         }
         _ => format!("not known why an event was {} late: {trouble}", span_text(-due)),
     };
-    with_power(record, span, Finding::new(Culprit::Unknown, what, ""))
+    with_power(record, span, Judgment::new(Culprit::Unknown, what, ""))
 }
 
 /// The host's block waited in the terminal for half of this span, because the link did not run.
-pub(super) fn of_link(record: &Record, span: Span) -> Option<Finding> {
+pub(super) fn of_link(record: &Record, span: Span) -> Option<Judgment> {
     let half = (span.1 - span.0) / 2;
     let waited = record.account(Watched::Link, span).map_or(0, |account| account.waited);
     if waited >= half && waited > PROMPT {
@@ -47,7 +47,7 @@ pub(super) fn of_link(record: &Record, span: Span) -> Option<Finding> {
 }
 
 /// The core did not do its work for half of this span.
-pub(super) fn of_core(record: &Record, span: Span) -> Option<Finding> {
+pub(super) fn of_core(record: &Record, span: Span) -> Option<Judgment> {
     let late = span.1 - span.0;
     let half = late / 2;
     let account = record.account(Watched::Core, span);
@@ -55,7 +55,7 @@ pub(super) fn of_core(record: &Record, span: Span) -> Option<Finding> {
     let stolen = record.stolen(span);
     if stolen >= half && stolen > waited && stolen > 0 {
         let what = format!("a hypervisor took {} of processor time while an event waited", span_text(stolen));
-        return Some(Finding::new(Culprit::Standstill, what, "give this virtual machine processors of its own"));
+        return Some(Judgment::new(Culprit::Standstill, what, "give this virtual machine processors of its own"));
     }
     if waited >= half && waited > 0 {
         return Some(with_power(record, span, starved(record, span, "the core", waited.min(late))));
@@ -68,11 +68,11 @@ pub(super) fn of_core(record: &Record, span: Span) -> Option<Finding> {
             !record.did_sleep(span) && record.events_of_core(span) >= FLOOD && ran.is_none_or(|ran| ran >= half);
         let what = format!("the core worked all the time and was {} late", span_text(late));
         let remedy = "fewer steps a second: lower the speed or the microsteps";
-        return is_flood.then(|| with_power(record, span, Finding::new(Culprit::Work, what, remedy)));
+        return is_flood.then(|| with_power(record, span, Judgment::new(Culprit::Work, what, remedy)));
     }
     let others = record.others_went_on(gap);
     let woke_late = record.latest_wake((gap.0, span.1 + PROMPT)) >= half;
-    // A core that works writes nothing for so long, if it is on time.
+    // A core that works and is on time writes nothing for this long.
     if gap_long <= QUIET && !woke_late && record.latest_within((span.0, span.1 + QUIET)) < half {
         return None;
     }
@@ -89,7 +89,7 @@ pub(super) fn of_core(record: &Record, span: Span) -> Option<Finding> {
     if woke_late {
         let what = format!("the kernel woke the core {} late, though it did not wait for a processor", span_text(late));
         let remedy = "use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor";
-        return Some(with_power(record, span, Finding::new(Culprit::Driver, what, remedy)));
+        return Some(with_power(record, span, Judgment::new(Culprit::Driver, what, remedy)));
     }
     if others {
         return Some(driver(record, span, gap_long));
@@ -99,16 +99,16 @@ pub(super) fn of_core(record: &Record, span: Span) -> Option<Finding> {
             "not known why the core did nothing for {}: it did not wait for a processor, so that a call blocked it, or everything stood still",
             span_text(gap_long)
         );
-        with_power(record, span, Finding::new(Culprit::Unknown, what, ""))
+        with_power(record, span, Judgment::new(Culprit::Unknown, what, ""))
     })
 }
 
-fn driver(record: &Record, span: Span, took: i64) -> Finding {
+fn driver(record: &Record, span: Span, took: i64) -> Judgment {
     let what = format!("one call to a driver or the kernel kept the core for {}", span_text(took));
-    with_power(record, span, Finding::new(Culprit::Driver, what, "look for its device in dmesg"))
+    with_power(record, span, Judgment::new(Culprit::Driver, what, "look for its device in dmesg"))
 }
 
-fn starved(record: &Record, span: Span, who: &str, waited: i64) -> Finding {
+fn starved(record: &Record, span: Span, who: &str, waited: i64) -> Judgment {
     let what = format!("{who} waited {} for a processor", span_text(waited));
     let (why, remedy) = match record.scheduling(span) {
         _ if !record.trace.head.realtime => {
@@ -124,5 +124,5 @@ fn starved(record: &Record, span: Span, who: &str, waited: i64) -> Finding {
             "look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
         ),
     };
-    Finding::new(Culprit::Processors, what + why, remedy)
+    Judgment::new(Culprit::Processors, what + why, remedy)
 }

@@ -4,19 +4,10 @@
 #![forbid(unsafe_code)]
 
 use super::evidence::{Record, Span};
-use super::processors::of_core;
-use super::{Culprit, Finding, PROMPT, SILENT, span_text};
-
-/// The core noticed that it gave no beat for a second or more, or that the computer was suspended.
-pub(super) fn stood_still(record: &Record, trouble: &str) -> Finding {
-    let gap = record.gap((record.first_of_core().unwrap_or(0).min(0), 0));
-    // The clock of the events stands still while the computer is suspended.
-    let found = if gap.1 - gap.0 > SILENT && gap.1 > -PROMPT { of_core(record, gap) } else { None };
-    found.unwrap_or_else(|| Finding::new(Culprit::Standstill, format!("everything stood still: {trouble}"), ""))
-}
+use super::{Culprit, Judgment, span_text};
 
 /// Nothing of the program ran in a span. `is_counted`: the kernel's account says that it did not wait for a processor.
-pub(super) fn standstill(record: &Record, gap: Span, is_counted: bool) -> Finding {
+pub(super) fn standstill(record: &Record, gap: Span, is_counted: bool) -> Judgment {
     let long = span_text(gap.1 - gap.0);
     let (what, remedy) = match record.guardian_went_on(gap) {
         Some(true) => (
@@ -33,5 +24,5 @@ pub(super) fn standstill(record: &Record, gap: Span, is_counted: bool) -> Findin
         ),
     };
     let other = if is_counted { "" } else { ", or which real-time work had all processors" };
-    Finding::new(Culprit::Standstill, what, format!("{remedy}{other}"))
+    Judgment::new(Culprit::Standstill, what, format!("{remedy}{other}"))
 }

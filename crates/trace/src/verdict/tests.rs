@@ -323,7 +323,7 @@ fn a_call_that_takes_long_is_told_from_a_flood_of_work() {
 }
 
 #[test]
-fn a_standstill_is_told_with_what_went_on() {
+fn a_standstill_is_named_with_the_threads_that_went_on() {
     const OURS: [&str; 3] = ["core", "link", "sampler"];
     let past = "Rescheduled timer in the past";
     let stood = |threads: &[&str]| {
@@ -354,7 +354,7 @@ fn a_standstill_is_told_with_what_went_on() {
             Culprit::Standstill,
             "everything stood still for 380.0 ms: find out who stopped Pinion, or paused or suspended the computer",
         );
-    // The sampler looks less often at a calm program, and does not miss its time.
+    // A calm program is sampled less often, and the sampler does not miss its time.
     let calm = |stood_from: u64| {
         let scene = Scene::calm().silent(&["sampler"], STOP - 1_200_000..STOP);
         let scene = scene.and("sampler", STOP - 400_000, processor(Watched::Core, 3, 0));
@@ -483,7 +483,7 @@ fn a_host_that_is_silent_or_gone_is_told() {
     missed(Scene::calm().and("link", STOP - 3 * SECOND, Event::HostGone)).judged(
         MISSED_PWM,
         Culprit::Host,
-        "the host closed the terminal 3.0 s before the stop: its log tells why it ended",
+        "the host closed the terminal 3.0 s before the stop: its log says why it ended",
     );
     missed(Scene::calm().and("link", STOP - 40_000, Event::BlockIn(9))).judged(
         MISSED_PWM,
@@ -545,7 +545,7 @@ fn a_network_that_is_gone_is_told_from_a_host_that_hangs() {
     silent().and("link", STOP - SECOND, Event::Alive).judged_over(
         SSH,
         Culprit::Host,
-        "the host sent no commands for 4.4 s, but its computer gave a sign of life; the core was never later than 0.1 ms: look at its log, and at its load",
+        "the host sent no commands for 4.4 s, but its computer sent keepalives; the core was never later than 0.1 ms: look at its log, and at its load",
     );
 }
 
@@ -617,7 +617,7 @@ fn a_program_that_is_gone_is_told_with_what_it_did_last() {
         "Pinion died at most 50.0 ms after the core's last event (the last command was queue_step): look for a panic in its log, and for who killed it (dmesg: out of memory)",
     );
     let hung = |scene: Scene, culprit, text: &str| {
-        let diagnosis = "the core gave no sign of life for 1000 ms".to_owned();
+        let diagnosis = "the core had no heartbeat for 1000 ms".to_owned();
         scene.and("guardian", STOP, Event::Listened).told(End::Hung { diagnosis }, culprit, text);
     };
     // It was stopped, and so was everything of it.
@@ -633,8 +633,8 @@ fn a_program_that_is_gone_is_told_with_what_it_did_last() {
         Culprit::Driver,
         "Pinion hung: one call to a driver or the kernel kept the core for 1.0 s: look for its device in dmesg",
     );
-    let owing = Scene::calm().silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST);
-    hung(owing, Culprit::Death, "Pinion hung: the core gave no sign of life for 1000 ms: report it with its log");
+    let pending = Scene::calm().silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST);
+    hung(pending, Culprit::Death, "Pinion hung: the core had no heartbeat for 1000 ms: report it with its log");
 }
 
 #[test]

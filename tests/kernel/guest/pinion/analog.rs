@@ -54,7 +54,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
     // The first device's channels also have the C program's names.
     config.push(input(7, "analog6"));
     configure(client, 8, &config);
-    program.wait_for_line(&["does not tell its resolution: 12 bits are assumed"]);
+    program.wait_for_line(&["does not report its resolution: 12 bits are assumed"]);
     for round in 0..3 {
         for (name, readings) in &channels {
             sysfs::write(adc::raw(name, 5), readings[round].0.to_string());

@@ -88,7 +88,7 @@ fn a_program_without_its_guardian_stops_and_says_so() {
 fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
     let outputs = Outputs::new();
     let log = end_by(&outputs, Signal::SIGSTOP);
-    assert!(log.contains("the core gave no sign of life for 550 ms"), "{log}");
+    assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
     let program = Program::start();
     outputs.switch_on(&mut program.connect(), 0);
 }
@@ -112,7 +112,7 @@ fn a_guardian_that_is_stopped_counts_as_lost() {
     assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
     assert_eq!(program.wait().code(), Some(1));
     assert!(!exists(guardian), "it would keep the lines");
-    program.wait_for_line(&["shutdown: Guardian process lost", "no sign of life: was it stopped?"]);
+    program.wait_for_line(&["shutdown: Guardian process lost", "no heartbeat: was it stopped?"]);
     let program = Program::start();
     outputs.switch_on(&mut program.connect(), 0);
 }

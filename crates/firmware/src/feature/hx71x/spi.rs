@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! An HX711 or HX717 on the data lines of an SPI controller: MOSI is the chip's clock, MISO its data. The controller
-//! times the pulses, whatever the computer does meanwhile.
+//! times the pulses, whatever the processors do.
 //!
 //! A pulse is two bits of MOSI, `10`. At 500 kHz a bit is 2 us long. So the clock is high for 2 us and low for 2 us. The
 //! data sheet has 0.2 to 50 us (T3), and at least 0.2 us (T4). Controllers round the rate down. From 20 kHz on they are
@@ -36,7 +36,7 @@ const PULSES: u8 = 0b1010_1010;
 const WAVE_BYTES: usize = 7;
 /// Bytes for which the clock is high, to switch the chip off: 128 us.
 const HIGH_BYTES: usize = 8;
-/// After this many looks without a sample the log says so. klippy wants ten looks for each sample, and the chip needs
+/// After this many polls without a sample the log says so. klippy wants ten polls for each sample, and the chip needs
 /// four samples to start.
 const LOOKS_MAX: u32 = 100;
 

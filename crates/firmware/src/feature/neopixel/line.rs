@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! WS2812 LEDs on a GPIO line, pulse by pulse.
 //!
-//! The times are those of the firmware's src/neopixel.c, which says what chips really need: a short pulse below 500 ns,
-//! a long one above 650 ns, 5 us from pulse to pulse at most, 1.25 us on average, 200 ns between two edges. The firmware
+//! The times are those of Klipper's src/neopixel.c, which says what chips really need: a short pulse below 500 ns,
+//! a long one above 650 ns, 5 us from pulse to pulse at most, 1.25 us on average, 200 ns between two edges. Klipper's C
 //! shuts out interrupts during a pulse. A program on Linux cannot. So each pulse is measured by the clock. The clock is
 //! read before and after each edge, and its step is part of the limits. So a pulse is surely longer than its shortest
 //! time and shorter than its longest. If a pulse missed its times, the frame is broken off, and sent again after the
@@ -28,7 +28,7 @@ use super::INVALID_SIZE;
 const TO_SPI: &str =
     "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\"";
 const OR_TO_FAST_LINE: &str =
-    ", or to a line that is written through registers (pinion pins lists them; none of a Raspberry Pi 5 will do)";
+    ", or to a line that is written through registers (pinion pins lists them), but not on a Raspberry Pi 5";
 const OR_BY_THE_KERNEL: &str = "; for LEDs without the host there is the kernel's overlay ws2812-pio";
 
 /// All chains on lines share this worker.
@@ -282,7 +282,7 @@ mod tests {
         (wire, pulses)
     }
 
-    /// The bits that a chain understands, by the limits that the firmware's src/neopixel.c names: the bits between two
+    /// The bits that a chain understands, by the limits that Klipper's src/neopixel.c names: the bits between two
     /// resets.
     /// `None`: a pulse or a pause that has no certain meaning.
     fn understood(edges: &[(u64, bool)]) -> Vec<Option<Vec<bool>>> {
@@ -324,7 +324,7 @@ mod tests {
         let edges = wire.edges.lock().unwrap().clone();
         assert_eq!(understood(&edges), [Some(bits(&COLORS)), Some(bits(&[0x55; 6]))]);
         for pulse in edges.windows(3).filter(|three| three[0].1 && three[2].0 - three[0].0 < 100_000) {
-            // WS2812B-V5: T0H, T1H; the firmware: 1250 ns a bit.
+            // WS2812B-V5: T0H, T1H; Klipper's C: 1250 ns a bit.
             let high = pulse[1].0 - pulse[0].0;
             assert!((220..=380).contains(&high) || (580..=1000).contains(&high), "{high}");
             assert!((1250..1300).contains(&(pulse[2].0 - pulse[0].0)), "{pulse:?}");

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A TMC UART on GPIO lines, bit by bit.
 //!
-//! The firmware has a timer for each bit. Here a job times a whole message on a worker. At 40 kbaud a message is up
+//! Klipper's C has a timer for each bit. Here a job times a whole message on a worker. At 40 kbaud a message is up
 //! to 5 ms of edges 25 us apart, which would keep the core awake. `benches/bits.rs` measures how late bits are
 //! in both cases (docs/develop/performance.md).
 //!
-//! The firmware samples a reply anywhere within a bit, wherever its timer happens to be. Here the start bit of each
+//! Klipper's C samples a reply anywhere within a bit, wherever its timer happens to be. Here the start bit of each
 //! byte is found, and bits are read in their middle. So half a bit of lateness does no harm. A start bit that is high
 //! again in its middle is a glitch and does not count.
 //!
@@ -123,7 +123,7 @@ impl Lines {
     /// Sends the bits, from `at` on, until one is late.
     fn send(&mut self, data: &[u8], mut at: Clock) -> Result<Sent, Shutdown> {
         let mut bit = self.bit;
-        // How long a write and a look at the clock take.
+        // How long a write and a read of the clock take.
         let mut cost = 0;
         let synced = data.first().is_some_and(|first| first & SYNC_MASK == SYNC);
         let mut line = true;

@@ -7,7 +7,7 @@
 //! the message from its first byte on. A reply cannot be taken for an echo. It begins with 05 FF, and FF is no driver's
 //! address.
 //!
-//! A reply that does not come, or is not whole, is empty, as in the firmware. klippy then asks again. This is also the
+//! A reply that does not come, or is not whole, is empty, as in Klipper's C. klippy then asks again. This is also the
 //! answer if the port fails. klippy stops the printer if it needed the answer.
 
 #![forbid(unsafe_code)]
@@ -32,7 +32,7 @@ const QUIET_READS: u32 = 16;
 
 /// The received bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Heard {
+enum Arrived {
     /// The reply, or the echo of a message without a reply.
     All,
     /// The echo alone.
@@ -54,7 +54,7 @@ pub(super) struct Port {
     /// Whether the port received its own messages so far.
     echoes: bool,
     /// The faults that it has warned of, each with the driver's address.
-    warned: Vec<(Heard, u8)>,
+    warned: Vec<(Arrived, u8)>,
     /// Whether there was a warning that the port failed.
     failed: bool,
     /// A warning for the log.
@@ -84,12 +84,12 @@ impl Port {
         }
     }
 
-    fn converse(&mut self, sent: &[u8], message: &mut Message) -> Result<Heard, Trouble> {
+    fn converse(&mut self, sent: &[u8], message: &mut Message) -> Result<Arrived, Trouble> {
         let reply_len = (8 * message.read_len).div_ceil(FRAME_BITS);
         self.device.send(sent)?;
         // The echo of a message without a reply is also awaited. It could come after the next message is sent.
         if reply_len == 0 && !self.echoes {
-            return Ok(Heard::All);
+            return Ok(Arrived::All);
         }
         let mut buffer = [0; 2 * BYTES_MAX];
         let mut len = 0;
@@ -106,18 +106,18 @@ impl Port {
         };
         let reply = buffer.get(from..len).unwrap_or_default();
         let heard = match len {
-            0 => Heard::Nothing,
-            _ if is_echo && len < sent.len() => Heard::Garbage,
-            _ if is_echo && reply.is_empty() && reply_len > 0 => Heard::Echo,
-            _ if !is_echo && reply_len == 0 => Heard::Garbage,
-            _ if reply.iter().zip(REPLY_HEAD).any(|(received, head)| *received != head) => Heard::Garbage,
-            _ if reply.len() < reply_len => Heard::Garbage,
-            _ => Heard::All,
+            0 => Arrived::Nothing,
+            _ if is_echo && len < sent.len() => Arrived::Garbage,
+            _ if is_echo && reply.is_empty() && reply_len > 0 => Arrived::Echo,
+            _ if !is_echo && reply_len == 0 => Arrived::Garbage,
+            _ if reply.iter().zip(REPLY_HEAD).any(|(received, head)| *received != head) => Arrived::Garbage,
+            _ if reply.len() < reply_len => Arrived::Garbage,
+            _ => Arrived::All,
         };
         match heard {
-            Heard::All => self.echoes = is_echo,
-            Heard::Garbage => self.await_quiet()?,
-            Heard::Echo | Heard::Nothing => {}
+            Arrived::All => self.echoes = is_echo,
+            Arrived::Garbage => self.await_quiet()?,
+            Arrived::Echo | Arrived::Nothing => {}
         }
         message.replied = reply_len > 0 && reply.len() == reply_len;
         bits_of(reply, &mut message.reply[..message.read_len]);
@@ -135,18 +135,18 @@ impl Port {
     }
 
     /// Warns of each fault once for each driver.
-    fn warn(&mut self, heard: Heard, address: u8) {
-        if heard == Heard::All || self.warned.contains(&(heard, address)) {
+    fn warn(&mut self, heard: Arrived, address: u8) {
+        if heard == Arrived::All || self.warned.contains(&(heard, address)) {
             return;
         }
         self.warned.push((heard, address));
         let text = match heard {
-            Heard::All => return,
-            Heard::Nothing => "it receives nothing, not even its own message: connect RX to the driver's UART pin, and TX to it through 1 kOhm, or free the port if another program reads it (pinion doctor); said once".to_owned(),
-            Heard::Echo => format!(
+            Arrived::All => return,
+            Arrived::Nothing => "it receives nothing, not even its own message: connect RX to the driver's UART pin, and TX to it through 1 kOhm, or free the port if another program reads it (pinion doctor); said once".to_owned(),
+            Arrived::Echo => format!(
                 "no driver answers at address {address}: check uart_address, the driver's motor supply, and the resistor of 1 kOhm at TX; said once"
             ),
-            Heard::Garbage => {
+            Arrived::Garbage => {
                 let faults = self.device.faults().unwrap_or_else(|| "the port counts no fault".to_owned());
                 format!(
                     "the answer at address {address} is garbage ({faults}): check the wires, the resistor of 1 kOhm at TX, and that no other program uses the port (pinion doctor); said once"

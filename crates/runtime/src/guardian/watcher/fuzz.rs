@@ -11,10 +11,12 @@ use std::sync::LazyLock;
 use nix::sys::socket::{AddressFamily, ControlMessage, SockFlag, SockType, recv, sendmsg, socketpair};
 use pinion_linux::clock::Monotonic;
 
+use nix::unistd::getppid;
+
 use super::*;
 
 /// A page that is shared with the guardian is never freed, so there is only one.
-static PULSE: LazyLock<Heartbeat> = LazyLock::new(|| Heartbeat::new(Monotonic::start()).expect("a page"));
+static HEARTBEAT: LazyLock<Heartbeat> = LazyLock::new(|| Heartbeat::new(Monotonic::start()).expect("a page"));
 /// The same for the memory of a recording.
 static RECORDING: LazyLock<Recording> = LazyLock::new(Recording::of_a_test);
 
@@ -24,7 +26,7 @@ pub fn guardian(mut bytes: &[u8]) {
     let kind = SockType::SeqPacket;
     let (ours, theirs) = socketpair(AddressFamily::Unix, kind, None, SockFlag::SOCK_CLOEXEC).expect("sockets");
     let file = File::open("/dev/null").expect("a file");
-    let mut watcher = Watcher::new(theirs, Program { pid: getppid(), pidfd: None }, *PULSE, RECORDING.clone());
+    let mut watcher = Watcher::new(theirs, Program { pid: getppid(), pidfd: None }, *HEARTBEAT, RECORDING.clone());
     let (mut names, mut files) = (BTreeSet::new(), 0);
     while let Some((&[head, len], rest)) = bytes.split_first_chunk() {
         let (message, rest) = rest.split_at(usize::from(len).min(rest.len()));

@@ -54,13 +54,13 @@ pub struct Checkout {
     pub unread: Option<String>,
     /// Every message that the host looks up.
     pub shapes: BTreeSet<Shape>,
-    /// The verdict on each dialect, in the order of [`DialectName::OF_HOSTS`].
-    pub verdicts: Vec<Verdict>,
+    /// How each dialect suits the host, in the order of [`DialectName::OF_HOSTS`].
+    pub fits: Vec<DialectFit>,
 }
 
 /// How a dialect suits a host.
 #[derive(Debug)]
-pub struct Verdict {
+pub struct DialectFit {
     /// The dialect.
     pub dialect: DialectName,
     /// Messages in the form that the dialect has.
@@ -84,12 +84,12 @@ impl Checkout {
         if ours.len() < SHAPES_MIN {
             return Err(io::Error::other(unread.unwrap_or_else(|| "it does not hold klippy's sources".into())));
         }
-        let verdict = |dialect| {
+        let fit = |dialect| {
             let known = known.iter().filter(|known| known.dialects.contains(dialect));
             let known: BTreeSet<&Shape> = known.map(|known| &known.shape).collect();
             let (served, other): (BTreeSet<&Shape>, _) = ours.iter().partition(|shape| known.contains(*shape));
             let owned = |shapes: BTreeSet<&Shape>| shapes.into_iter().cloned().collect();
-            Verdict { dialect, served: owned(served), other: owned(other) }
+            DialectFit { dialect, served: owned(served), other: owned(other) }
         };
         let folder = klippy.parent().unwrap_or(klippy).to_owned();
         Ok(Checkout {
@@ -97,24 +97,24 @@ impl Checkout {
             folder,
             newest,
             unread,
-            verdicts: DialectName::OF_HOSTS.into_iter().map(verdict).collect(),
+            fits: DialectName::OF_HOSTS.into_iter().map(fit).collect(),
             shapes,
         })
     }
 
     /// The dialect that has most of the messages that the host looks up. Of several it is the newest.
-    pub fn best(&self) -> &Verdict {
-        let best = self.verdicts.iter().rev().min_by_key(|verdict| verdict.other.len());
+    pub fn best(&self) -> &DialectFit {
+        let best = self.fits.iter().rev().min_by_key(|fit| fit.other.len());
         match best {
-            Some(verdict) => verdict,
-            None => unreachable!("there is a verdict for each dialect"),
+            Some(fit) => fit,
+            None => unreachable!("there is one for each dialect"),
         }
     }
 
     /// Messages that no dialect has in this form, though it knows their names. The host is newer than all that this
     /// program knows, and these messages will not be served.
     pub fn unknown(&self) -> impl Iterator<Item = &Shape> {
-        let everywhere = |shape: &&Shape| self.verdicts.iter().all(|verdict| verdict.other.contains(*shape));
+        let everywhere = |shape: &&Shape| self.fits.iter().all(|fit| fit.other.contains(*shape));
         self.best().other.iter().filter(everywhere)
     }
 }

@@ -24,7 +24,7 @@ const STARTTIME: usize = 22;
 /// Highest number of open files of a process that are looked at. klippy has less than a hundred.
 const OPEN_FILES_MAX: usize = 4096;
 /// Highest number of open files that are looked at of all processes that may not open the terminal. Any user can have
-/// many processes with many files. A look takes 2 us to 20 us.
+/// many processes with many files. To inspect one takes 2 us to 20 us.
 const UNLIKELY_FILES_MAX: usize = 10_000;
 /// The major numbers of pseudo terminals (admin-guide/devices.txt).
 const PSEUDO_MAJORS: std::ops::RangeInclusive<u64> = 136..=143;
@@ -136,7 +136,7 @@ impl Ids {
 ///
 /// `proc` itself cannot be looked at.
 pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
-    // The kernel does not say who has a terminal open. A look into a process costs a call for each of its files. So the
+    // The kernel does not say who has a terminal open. To inspect a process costs a call for each of its files. So the
     // processes that may open the terminal come first, klippys come before others, and a parent comes before its
     // children.
     let candidate = |process: Process| {
@@ -157,7 +157,7 @@ pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
             Err(error) if error.kind() == io::ErrorKind::PermissionDenied && !is_refused && process.is_klippy() => {
                 hidden.push(process);
             }
-            // It is not the host, or it ended meanwhile.
+            // It is not the host, or it has ended.
             Ok(_) | Err(_) => {}
         }
     }
@@ -398,11 +398,11 @@ fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
     let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.number));
     let Ok(files) = fs::read_dir(process.join("fdinfo")) else { return false };
     let files = files.flatten().take(OPEN_FILES_MAX);
-    let mut told = files.filter_map(|file| foreign::read(&file.path(), PROC_BYTES_MAX).ok());
-    told.any(|info| info.split(|byte| *byte == b'\n').any(|line| line == index.as_bytes()))
+    let mut infos = files.filter_map(|file| foreign::read(&file.path(), PROC_BYTES_MAX).ok());
+    infos.any(|info| info.split(|byte| *byte == b'\n').any(|line| line == index.as_bytes()))
 }
 
-/// Whether a process has the terminal open. `left` is the number of files to look at.
+/// Whether a process has the terminal open. `left` is the number of files that may still be inspected.
 fn has_open(proc: &Path, pid: u32, terminal: Terminal, left: &mut usize) -> io::Result<bool> {
     for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))? {
         if *left == 0 {
@@ -410,7 +410,7 @@ fn has_open(proc: &Path, pid: u32, terminal: Terminal, left: &mut usize) -> io::
         }
         *left -= 1;
         let file = match fs::metadata(entry?.path()) {
-            // The file was closed meanwhile.
+            // The file was closed after the folder was read.
             Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
             file => file?,
         };

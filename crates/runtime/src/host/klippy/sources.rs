@@ -100,7 +100,7 @@ impl Sources {
                 entries => entries?,
             };
             for entry in entries {
-                // The checkout may change meanwhile: an update, or a plugin that is installed.
+                // The checkout may change while it is read: an update, or a plugin that is installed.
                 let entry = match entry {
                     Err(error) => {
                         sources.leave_out(&folder, &error);
@@ -158,8 +158,8 @@ impl Sources {
     }
 }
 
-/// Passes each string of a Python source to `tell`. Adjacent literals are one string.
-fn strings(source: &[u8], mut tell: impl FnMut(&str)) {
+/// Passes each string of a Python source to `found`. Adjacent literals are one string.
+fn strings(source: &[u8], mut found: impl FnMut(&str)) {
     let mut at = 0;
     // The bytes of the literals so far, if the last token was one.
     let mut string: Option<Vec<u8>> = None;
@@ -174,22 +174,22 @@ fn strings(source: &[u8], mut tell: impl FnMut(&str)) {
                 // `r"..."` and the like: the letters belong to the literal.
                 let is_prefix = end - at <= 2 && matches!(source.get(end), Some(b'"' | b'\''));
                 if !is_prefix {
-                    flush(&mut string, &mut tell);
+                    flush(&mut string, &mut found);
                 }
                 at = end;
             }
             _ => {
-                flush(&mut string, &mut tell);
+                flush(&mut string, &mut found);
                 at += 1;
             }
         }
     }
-    flush(&mut string, &mut tell);
+    flush(&mut string, &mut found);
 }
 
-fn flush(string: &mut Option<Vec<u8>>, tell: &mut impl FnMut(&str)) {
+fn flush(string: &mut Option<Vec<u8>>, found: &mut impl FnMut(&str)) {
     if let Some(Ok(string)) = string.take().map(String::from_utf8) {
-        tell(&string);
+        found(&string);
     }
 }
 
@@ -227,21 +227,21 @@ pub fn fuzz(bytes: &[u8]) {
 mod tests {
     use super::*;
 
-    fn told(source: &str) -> Vec<String> {
-        let mut told = Vec::new();
-        strings(source.as_bytes(), |string| told.push(string.to_owned()));
-        told
+    fn strings_of(source: &str) -> Vec<String> {
+        let mut strings_of = Vec::new();
+        strings(source.as_bytes(), |string| strings_of.push(string.to_owned()));
+        strings_of
     }
 
     #[test]
     fn adjacent_literals_are_one_string() {
-        assert_eq!(told("f('a' \"b\"\n  # not \"this\"\n  r'c', 'd')"), ["abc", "d"]);
-        assert_eq!(told("x = \"a\" \\\n 'b'\ny = 'c' % (1,)"), ["ab", "c"]);
-        assert_eq!(told("'it\\'s' + \"so\""), ["it\\'s", "so"]);
-        assert_eq!(told("\"\"\"a \"long\" one\n'\"\"\" 'b'"), ["a \"long\" one\n'b"]);
-        assert_eq!(told("word'a'"), ["a"], "no Python, and no reason to fail");
-        assert_eq!(told("'open\n'b'"), ["openb"]);
-        assert_eq!(told("'ends with \\"), ["ends with \\"]);
+        assert_eq!(strings_of("f('a' \"b\"\n  # not \"this\"\n  r'c', 'd')"), ["abc", "d"]);
+        assert_eq!(strings_of("x = \"a\" \\\n 'b'\ny = 'c' % (1,)"), ["ab", "c"]);
+        assert_eq!(strings_of("'it\\'s' + \"so\""), ["it\\'s", "so"]);
+        assert_eq!(strings_of("\"\"\"a \"long\" one\n'\"\"\" 'b'"), ["a \"long\" one\n'b"]);
+        assert_eq!(strings_of("word'a'"), ["a"], "no Python, and no reason to fail");
+        assert_eq!(strings_of("'open\n'b'"), ["openb"]);
+        assert_eq!(strings_of("'ends with \\"), ["ends with \\"]);
     }
 
     #[test]

@@ -153,7 +153,7 @@ impl Looker {
         }
         let mut host =
             FoundHost { pid: process.pid, is_sure, is_attach: process.is_attach(), checkout: None, commit: None };
-        let found = tell(&process, &mut host, began, say);
+        let found = dialect_of(&process, &mut host, began, say);
         self.host = Some(host);
         self.last = found.map(|dialect| (process, dialect));
         (found.unwrap_or(DialectName::Union), self.host.clone())
@@ -174,7 +174,7 @@ fn union(remedy: &str) -> String {
 
 /// The dialect of a process, or `None` if it is unknown. It logs a line that says why, and notes in `host` where the
 /// process runs from.
-fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<DialectName> {
+fn dialect_of(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<DialectName> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
         let remedy = "for an older one name its --dialect";

@@ -110,7 +110,7 @@ impl HostFinder {
     ) -> io::Result<HostFinder> {
         let terminal = Terminal::of(device)?;
         let socket = Arc::new(search.0);
-        let (tell, answers) = channel();
+        let (sender, answers) = channel();
         let (monitor, shown) = (socket.clone(), board.clone());
         thread::Builder::new().name("host".into()).spawn(move || {
             let mut message = vec![0; MESSAGE_BYTES_MAX];
@@ -122,14 +122,14 @@ impl HostFinder {
                 }
                 let dialect = answer.dialect();
                 shown.found(answer.host);
-                let told = tell.send((answer.number, dialect));
+                let sent = sender.send((answer.number, dialect));
                 wake.wake();
-                if told.is_err() {
+                if sent.is_err() {
                     return;
                 }
             }
             warn!("the search for the host has ended, or sent nonsense, so every host gets the union of v0.13, master and Kalico: restart Pinion when no print runs");
-            drop(tell);
+            drop(sender);
             wake.wake();
         })?;
         Ok(HostFinder { socket, terminal, board, answers, asked: 0 })

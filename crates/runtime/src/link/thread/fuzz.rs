@@ -29,7 +29,7 @@ use crate::process::signals::Signals;
 use crate::process::watchdog::Vigil;
 use crate::recorder::Recording;
 use crate::status::HostStatus;
-use crate::transport::Link as _;
+use crate::transport::Transport as _;
 use crate::transport::pty::{Access, Pty};
 
 /// Memory that is shared with a guardian is never freed, so there is only one recording.

@@ -24,7 +24,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::can;
 use pinion_linux::clock::monotonic;
 
-use super::{Heard, Link};
+use super::{Input, Transport};
 use crate::trouble::refused;
 
 mod node;
@@ -72,7 +72,7 @@ pub(crate) struct CanBus {
 
 enum State {
     Open(CanSocket),
-    /// It is not there. When to look for it.
+    /// It is not there. The time of the next try.
     Gone(Duration),
 }
 
@@ -173,7 +173,7 @@ impl CanBus {
     }
 
     /// The socket has failed with this error.
-    fn failed(&mut self, error: &io::Error) -> Heard {
+    fn failed(&mut self, error: &io::Error) -> Input {
         match error.raw_os_error() {
             Some(libc::ENETDOWN) => {
                 if self.is_up {
@@ -181,7 +181,7 @@ impl CanBus {
                 }
                 self.is_up = false;
                 // The socket works again when the interface is up.
-                Heard::Bytes(0)
+                Input::Bytes(0)
             }
             _ => {
                 warn!(
@@ -189,7 +189,7 @@ impl CanBus {
                     self.interface
                 );
                 self.state = State::Gone(monotonic() + REOPEN);
-                Heard::Gone
+                Input::Gone
             }
         }
     }
@@ -308,7 +308,7 @@ fn is_full(error: &io::Error) -> bool {
     error.kind() == ErrorKind::WouldBlock || error.raw_os_error() == Some(libc::ENOBUFS)
 }
 
-impl Link for CanBus {
+impl Transport for CanBus {
     fn place(&self) -> String {
         self.interface.clone()
     }
@@ -337,11 +337,11 @@ impl Link for CanBus {
         reopen.into_iter().chain(self.full_until).chain(renewed).min()
     }
 
-    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Input> {
         // The pause is over, even if there is nothing to write any more.
         self.full_until = None;
         if std::mem::take(&mut self.is_renewed) && self.is_met {
-            return Ok(Heard::Gone);
+            return Ok(Input::Gone);
         }
         let (mut len, mut frames) = (0, 0);
         // A whole frame must fit. Frames without bytes for the MCU must not keep the link, however many there are.
@@ -379,7 +379,7 @@ impl Link for CanBus {
         if self.owes_answer {
             self.answer();
         }
-        Ok(Heard::Bytes(len))
+        Ok(Input::Bytes(len))
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {

@@ -22,7 +22,7 @@ const SET_KLIPPER_NODEID: u8 = 0x01;
 const NEED_NODEID: u8 = 0x20;
 /// Longest frame.
 pub(super) const FRAME_BYTES_MAX: usize = 8;
-/// The seed of the firmware's hash.
+/// The seed of Klipper's hash.
 const UUID_SEED: u64 = 0xa162_31a7;
 
 /// The name of a node, as `canbus_uuid` in printer.cfg has it.
@@ -30,7 +30,7 @@ const UUID_SEED: u64 = 0xa162_31a7;
 pub struct CanbusUuid(pub(super) [u8; CANBUS_UUID_BYTES]);
 
 impl CanbusUuid {
-    /// The hash of a computer's own identity, as the firmware hashes the number of a chip.
+    /// The hash of a computer's own identity, as Klipper's C hashes the number of a chip.
     pub fn of(identity: &[u8]) -> CanbusUuid {
         let [a, b, c, d, e, f, ..] = fasthash64(identity, UUID_SEED).to_le_bytes();
         CanbusUuid([a, b, c, d, e, f])
@@ -57,7 +57,7 @@ impl FromStr for CanbusUuid {
     }
 }
 
-/// Zilong Tan's fast-hash, as the firmware uses it.
+/// Zilong Tan's fast-hash, as Klipper's C uses it.
 fn fasthash64(bytes: &[u8], seed: u64) -> u64 {
     const M: u64 = 0x8803_55f2_1e6d_1965;
     let mix = |mut hash: u64| {
@@ -90,7 +90,7 @@ pub(super) enum Meaning {
 
 /// A node.
 pub(super) struct Node {
-    /// The firmware's `assigned_id`: the id of the host's frames. The answers have the next one.
+    /// Klipper's `assigned_id`: the id of the host's frames. The answers have the next one.
     assigned_id: Option<u16>,
     shared: Arc<CanNode>,
 }
@@ -214,7 +214,7 @@ mod tests {
 
     #[test]
     fn a_uuid_is_the_firmwares_hash() {
-        // Results of fasthash64 of Klipper's lib/fast-hash, with the firmware's seed.
+        // Results of fasthash64 of Klipper's lib/fast-hash, with Klipper's seed.
         for (identity, uuid) in [
             ("", "bc1b64c6908d"),
             ("a", "bee6cb50dcb3"),

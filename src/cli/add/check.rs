@@ -1,0 +1,144 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Asks the device, before anything is written to printer.cfg.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+
+use serde_json::json;
+
+use crate::cli::computer::{Access, Computer};
+use crate::cli::quietly;
+
+use super::Work;
+use super::catalog::{Check, KnownBoard, Spot};
+use super::printer::Printer;
+use super::probe::{self, Answer};
+
+impl Work<'_> {
+    /// Asks the device. Returns its I2C address.
+    pub(super) fn check(&mut self, printer: Option<&Printer>) -> Result<Option<u8>, String> {
+        let node = self.node().to_owned();
+        let mut checks = Vec::new();
+        let path = format!("/dev/{node}");
+        if let Ok(about) = std::fs::metadata(self.computer.path(&path)) {
+            checks.push(format!("{path} is there"));
+            if let Some(user) = self.computer.user("pinion")
+                && !user.may(Access::READ_WRITE, &about)
+            {
+                checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says what is missing"));
+            }
+        }
+        checks.extend(strays(self.computer, self.board, &self.spot));
+        let asked = match (&self.way.check, self.way.driver.is_some()) {
+            (Some(Check::W1), _) => match self.thermometer(printer) {
+                Some(serial) => Ok(Answer { text: format!("the thermometer {serial} answers"), address: None }),
+                None => {
+                    Err("no DS18B20 answers: check its wires and the resistor of 4.7 kOhm from data to 3.3 V".into())
+                }
+            },
+            (Some(Check::Iio { file, highest }), _) => self.sample(file, *highest),
+            (Some(_), false) => match probe::Live::of(&node) {
+                Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &mut live)),
+                None => Err(format!("{node} is no bus")),
+            },
+            _ => Ok(Answer { text: "it cannot be asked: try it out".into(), address: None }),
+        };
+        checks.push(match &asked {
+            Ok(answer) => format!("{}: {}", self.device.name, answer.text),
+            Err(why) => format!("{}: {why}", self.device.name),
+        });
+        self.report.set("checks", json!(checks));
+        checks.iter().for_each(|line| self.report.line(line));
+        self.report.show()?;
+        match asked {
+            Ok(answer) => Ok(answer.address),
+            Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, self.command())),
+        }
+    }
+
+    /// Reads a value of the chip by its driver, which does not know whether the chip is there.
+    fn sample(&self, file: &str, highest: u32) -> Result<Answer, String> {
+        let folder = self.iio().ok_or("its driver has gone: reboot")?;
+        let value = self.computer.text(self.computer.name(&folder.join(file)));
+        let value: u32 = value.and_then(|text| text.parse().ok()).ok_or_else(|| format!("{file} cannot be read"))?;
+        match value {
+            0 => Err(format!("{file} is 0: no power, DOUT is not connected, or the input touches ground")),
+            _ if value >= highest => {
+                Err(format!("{file} is {value}, the highest value: no ground, or nothing is connected at the input"))
+            }
+            _ => Ok(Answer { text: format!("{file} is {value} of {highest}"), address: None }),
+        }
+    }
+
+    /// The folder of the device of the chip's driver.
+    pub(super) fn iio(&self) -> Option<PathBuf> {
+        let driver = self.way.driver.as_deref();
+        let names = self.computer.matching("/sys/bus/iio/devices/iio:device*/name");
+        let name = names.iter().find(|name| self.computer.text(self.computer.name(name)).as_deref() == driver)?;
+        name.parent().map(Path::to_owned)
+    }
+
+    /// A thermometer that printer.cfg does not have yet.
+    pub(super) fn thermometer(&self, printer: Option<&Printer>) -> Option<String> {
+        let known = printer.map(|printer| printer.serials(self.device)).unwrap_or_default();
+        let found = self.computer.matching("/sys/bus/w1/devices/28-*");
+        let names = found.iter().filter_map(|path| path.file_name()?.to_str());
+        let is_serial = |name: &&str| name.chars().all(|c| c.is_ascii_hexdigit() || c == '-');
+        names.filter(is_serial).find(|name| !known.contains(name)).map(str::to_owned)
+    }
+}
+
+/// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
+fn strays(computer: &Computer, board: &KnownBoard, spot: &Spot) -> Vec<String> {
+    let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
+    let is_header = |path: &&PathBuf| {
+        let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+        ["bcm2835", "bcm2711", "rp1"].iter().any(|chip| name.ends_with(chip))
+    };
+    let text = controllers.iter().find(is_header).and_then(|path| computer.text(computer.name(path)));
+    let text = text.unwrap_or_default();
+    // The driver selects a chip by a line, and 1-Wire is bits on a line.
+    let pins = spot.pins.iter().filter(|(role, _)| !["cs", "data"].contains(&role.as_str()));
+    let stray = |(_, pin): (&String, &usize)| {
+        let label = board.pins.get(pin - 1)?;
+        let line: u32 = label.strip_prefix("GPIO")?.split(' ').next()?.parse().ok()?;
+        // For example "pin 10 (gpio10) function gpio_out in hi; irq 0 (none)".
+        let is_it = |text: &&str| text.starts_with(&format!("pin {line} ("));
+        let function = text.lines().find(is_it)?.split_once(" function ")?.1.split(' ').next()?;
+        function.starts_with("gpio").then(|| {
+            format!(
+                "pin {pin} ({label}) is a GPIO line now: another program has switched it: end that program, or reboot"
+            )
+        })
+    };
+    pins.filter_map(stray).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::add::catalog::Catalog;
+    use crate::cli::computer::tests::Tree;
+
+    #[test]
+    fn a_pin_of_the_bus_that_another_program_has_switched_is_named() {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B");
+        // Pin controllers of other chips have pins of the same numbers.
+        tree.put("sys/kernel/debug/pinctrl/107d504100.pinctrl-pinctrl-bcm2712/pins", "pin 11 (gpio11) function gpio\n");
+        let pins = "registered pins: 58\n\
+                    pin 8 (gpio8) function gpio_out in hi; irq 0 (none)\n\
+                    pin 9 (gpio9) function alt0 in lo; irq 0 (none)\n\
+                    pin 10 (gpio10) function gpio_in in lo; irq 0 (none)\n\
+                    pin 11 (gpio11) function alt0 in lo; irq 0 (none)\n";
+        tree.put("sys/kernel/debug/pinctrl/fe200000.gpio-pinctrl-bcm2711/pins", pins);
+        let catalog = Catalog::read().unwrap();
+        let computer = tree.computer();
+        let board = catalog.board(&computer).unwrap();
+        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None).unwrap();
+        let found = strays(&computer, board, &spot);
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(found[0].starts_with("pin 19 (GPIO10 MOSI) is a GPIO line now"), "{found:?}");
+    }
+}
