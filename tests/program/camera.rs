@@ -51,7 +51,7 @@ fn snapshot_of(address: SocketAddr, target: &str) -> Vec<u8> {
 
 /// 800 steps of these motors: 10 mm of x, 8 mm of filament.
 fn turn(client: &mut Client, motors: &[u8], dir: u8) {
-    let clock = client.clock_in(0.2).unwrap().wire();
+    let clock = client.clock_in(1.0).unwrap().wire();
     for oid in motors {
         for line in [
             format!("reset_step_clock oid={oid} clock={clock}"),
@@ -111,7 +111,10 @@ fn no_thread_of_the_camera_is_in_a_hurry() {
     let (pinion, camera) = start(&["-r", "--show"]);
     let mut viewer = request(camera, "/stream");
     viewer.read_exact(&mut [0; 1000]).unwrap();
-    for thread in ["camera", "camera path", "camera pen", "camera targets", "camera viewer"] {
+    let threads = ["camera", "camera path", "camera pen", "camera targets", "camera viewer"];
+    // A thread has the name of the one that started it until it runs.
+    pinion.until("the threads", || threads.iter().all(|thread| pinion.scheduling(thread).len() == 1));
+    for thread in threads {
         assert_eq!(pinion.scheduling(thread), [(0, 10)], "{thread}: SCHED_OTHER, and nice");
     }
     assert!(matches!(pinion.scheduling("own status")[..], [(0, _)]), "SCHED_OTHER");

@@ -55,7 +55,7 @@ pub fn begin(host: &mut Client, heat_s: f64) {
     ] {
         host.send_line(command).unwrap();
     }
-    let start = host.clock_in(0.3).unwrap().wire();
+    let start = host.clock_in(1.0).unwrap().wire();
     let expires = start.wrapping_add(ticks(host, TRSYNC_S));
     let interval = ticks(host, STEP_S);
     for command in [

@@ -165,7 +165,7 @@ fn read_temperature(pinion: &Pinion, query: &str) -> String {
     // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets the
     // MCU.
     config.apply(&mut client).unwrap();
-    let clock = client.clock_in(0.05).unwrap();
+    let clock = client.clock_in(1.0).unwrap();
     client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
     let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::WAIT_MAX);
     format!("{:?}", state.unwrap().unwrap())

@@ -32,8 +32,6 @@ fn drive(link: &Path) -> Client {
 #[test]
 fn each_change_is_a_line() {
     let mut pinion = Pinion::start(&["sim", "-r", "--show"]);
-    pinion.until("all things once", || pinion.out().contains("] dots: "));
-    let first = pinion.out();
     for line in [
         "x: 60.00 mm",
         "axis extruder: 0.00 mm",
@@ -42,7 +40,9 @@ fn each_change_is_a_line() {
         "light: off",
         "display: dark",
     ] {
-        assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
+        pinion.until(line, || pinion.out().contains(&format!("] {line}\n")));
+        let shown = pinion.out();
+        assert_eq!(shown.matches(&format!("] {line}\n")).count(), 1, "{line}\n{shown}");
     }
     assert!(matches!(pinion.scheduling("show")[..], [(0, _)]), "to show something is no hurry (SCHED_OTHER)");
     let mut client = drive(&pinion.link());

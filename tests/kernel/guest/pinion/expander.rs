@@ -198,6 +198,7 @@ fn steps_beside_a_slow_output_are_in_time() {
     run(client, "update_digital_out oid=1 value=1");
     assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
     thread::sleep(Duration::from_millis(500));
+    sysfs::wait_until("all steps are made", || trace.writes_to(step).len() >= 2000);
     let edges = trace.writes_to(step);
     let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
     assert_eq!(rising.len(), 1000);
@@ -442,9 +443,9 @@ fn missed(program: &Program) -> (u64, u64) {
 fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
     let (expander, program, mut client) = with_inputs();
     let client = &mut client;
-    for _ in 0..10 {
+    for count in 1..=10 {
         expander.miss_one();
-        thread::sleep(Duration::from_millis(20));
+        sysfs::wait_until("the transfer is tried again", || missed(&program) == (count, count));
     }
     for level in [false, true] {
         expander.miss_one();
