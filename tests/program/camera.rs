@@ -9,16 +9,14 @@ use nix::sys::signal::Signal;
 use pinion_client::Client;
 use pinion_testkit::browser;
 
-use crate::process::{Pinion, WAIT_MAX, exists, output};
+use crate::process::{Pinion, WAIT_MAX, exists, output, printed};
 
 /// The x axis is oid 1, the extruder oid 3.
 const MOTORS: &[&str] = &[
-    "allocate_oids count=4",
     "config_digital_out oid=0 pin=x_enable value=0 default_value=0 max_duration=0",
     "config_stepper oid=1 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
     "config_digital_out oid=2 pin=e_enable value=0 default_value=0 max_duration=0",
     "config_stepper oid=3 step_pin=e_step dir_pin=e_dir invert_step=0 step_pulse_ticks=100",
-    "finalize_config crc=1",
 ];
 
 /// A printer with a camera at a free port. It says where that is.
@@ -53,7 +51,7 @@ fn snapshot_of(address: SocketAddr, target: &str) -> Vec<u8> {
 
 /// 800 steps of these motors: 10 mm of x, 8 mm of filament.
 fn turn(client: &mut Client, motors: &[u8], dir: u8) {
-    let clock = client.clock_in(0.2).unwrap().wire();
+    let clock = client.clock_in(1.0).unwrap().wire();
     for oid in motors {
         for line in [
             format!("reset_step_clock oid={oid} clock={clock}"),
@@ -68,11 +66,7 @@ fn turn(client: &mut Client, motors: &[u8], dir: u8) {
 #[test]
 fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
     let (mut pinion, camera) = start(&["--show"]);
-    let mut client = Client::connect(&pinion.link(), WAIT_MAX).unwrap();
-    for line in MOTORS {
-        client.send_line(line).unwrap();
-    }
-    assert!(client.status().unwrap().is_config);
+    let mut client = pinion.configured(MOTORS);
     // The push-pin of the built-in printer's probe goes up at the start.
     pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
     let before = snapshot(camera);
@@ -101,11 +95,7 @@ fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
 #[test]
 fn a_shutdown_is_in_the_picture() {
     let (pinion, camera) = start(&["--show"]);
-    let mut client = Client::connect(&pinion.link(), WAIT_MAX).unwrap();
-    for line in MOTORS {
-        client.send_line(line).unwrap();
-    }
-    assert!(client.status().unwrap().is_config);
+    let mut client = pinion.configured(MOTORS);
     pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
     let before = snapshot(camera);
     client.emergency_stop().unwrap();
@@ -121,7 +111,10 @@ fn no_thread_of_the_camera_is_in_a_hurry() {
     let (pinion, camera) = start(&["-r", "--show"]);
     let mut viewer = request(camera, "/stream");
     viewer.read_exact(&mut [0; 1000]).unwrap();
-    for thread in ["camera", "camera path", "camera pen", "camera targets", "camera viewer"] {
+    let threads = ["camera", "camera path", "camera pen", "camera targets", "camera viewer"];
+    // A thread has the name of the one that started it until it runs.
+    pinion.until("the threads", || threads.iter().all(|thread| pinion.scheduling(thread).len() == 1));
+    for thread in threads {
         assert_eq!(pinion.scheduling(thread), [(0, 10)], "{thread}: SCHED_OTHER, and nice");
     }
     assert!(matches!(pinion.scheduling("own status")[..], [(0, _)]), "SCHED_OTHER");
@@ -147,7 +140,7 @@ fn nobody_else_reaches_it_unless_told() {
     let port = line.split("http://").nth(1).unwrap().split('/').next().unwrap().rsplit(':').next().unwrap();
     snapshot(SocketAddr::from(([127, 0, 0, 2], port.parse().unwrap())));
     // Without an address it is this computer's own.
-    let help = String::from_utf8(output(&["sim", "--help"]).stdout).unwrap();
+    let help = printed(&["sim", "--help"]);
     let words: Vec<&str> = help.split_whitespace().collect();
     assert!(words.join(" ").contains("on 127.0.0.1:8410 unless told"), "{help}");
 }

@@ -4,19 +4,17 @@
 use std::collections::HashMap;
 use std::fs;
 use std::process::{Command, Stdio};
-use std::thread;
-use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
-use pinion_testkit::here;
+use pinion_testkit::process::Running;
+use pinion_testkit::{here, wait};
 use serde_json::Value;
 
-use crate::process::{Pinion, WAIT_MAX, closed_pipe, folder_with, output, pinion_path};
+use crate::process::{Pinion, closed_pipe, folder_with, output, pinion_path, printed};
 
 /// The built-in printer with a bed that warms up within seconds.
 fn quick_printer() -> String {
-    let printer = output(&["sim", "--print-board"]);
-    let printer = String::from_utf8(printer.stdout).unwrap();
+    let printer = printed(&["sim", "--print-board"]);
     let quick = printer.replace("heat_capacity_j_per_k = 400.0", "heat_capacity_j_per_k = 60.0");
     assert_ne!(quick, printer, "the built-in printer's bed is another one");
     quick
@@ -93,14 +91,16 @@ fn a_demonstration_that_is_interrupted_ends_without_a_complaint() {
 
 #[test]
 fn dict_prints_what_identify_serves() {
-    let (_folder, file) = folder_with("dict", "");
-    let printed = output(&["dict", "--board", "sim", "-o", file.to_str().unwrap()]);
-    assert!(printed.status.success());
-    let pinion = Pinion::simulated(&["--dialect", "master"]);
-    let served = pinion.client().dictionary().json().unwrap();
-    // Not assert_eq, because it would print about ten thousand numbers.
-    assert!(fs::read(&file).unwrap() == served);
-    assert!(output(&["dict", "--board", "sim"]).stdout == served);
+    for (dialect, args) in [("master", &[][..]), ("v0.13", &["--dialect", "v0.13"])] {
+        let (_folder, file) = folder_with("dict", "");
+        let dict = [&["dict", "--board", "sim"], args].concat();
+        assert!(output(&[&dict[..], &["-o", file.to_str().unwrap()]].concat()).status.success());
+        let pinion = Pinion::simulated(&["--dialect", dialect]);
+        let served = pinion.client().dictionary().json().unwrap();
+        // Not assert_eq, because it would print about ten thousand numbers.
+        assert!(fs::read(&file).unwrap() == served, "{dialect}");
+        assert!(output(&dict).stdout == served, "{dialect}");
+    }
 }
 
 /// The dictionaries of the firmwares' own `linux` processes, with their dialect and their version.
@@ -294,13 +294,6 @@ fn a_dialect_that_is_none_is_explained() {
 }
 
 #[test]
-fn an_mcu_serves_the_dictionary_of_its_dialect() {
-    let printed = output(&["dict", "--board", "sim", "--dialect", "v0.13"]);
-    let pinion = Pinion::simulated(&["--dialect", "v0.13"]);
-    assert_eq!(pinion.client().dictionary().json().unwrap(), printed.stdout);
-}
-
-#[test]
 fn a_board_that_is_none_is_explained() {
     let (_folder, toml) = folder_with("bad.toml", "[[axis]]\nname = \"x\"\nstep_pin = \"s\"\nwheels = 4\n");
     let board = format!("sim:{}", toml.display());
@@ -385,7 +378,7 @@ fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
 
 #[test]
 fn the_version_tells_the_state_of_the_sources_and_the_dictionary_tells_the_same() {
-    let version = String::from_utf8(output(&["--version"]).stdout).unwrap();
+    let version = printed(&["--version"]);
     let version = version.trim().strip_prefix("pinion ").unwrap();
     let (number, state) = version.split_once('-').unwrap_or((version, ""));
     assert_eq!(number, env!("CARGO_PKG_VERSION"));
@@ -424,7 +417,7 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         }
     }
     // bash's own result.
-    let script = String::from_utf8(output(&["completions", "bash"]).stdout).unwrap();
+    let script = printed(&["completions", "bash"]);
     for (words, offered) in [
         ("--board ''", "linux sim"),
         ("run --dialect v0.1", "v0.11 v0.12 v0.13"),
@@ -450,24 +443,14 @@ fn the_recipe_for_ci_ends_if_the_simulated_printer_cannot_start() {
     let recipe = recipe.replace("/tmp/printer", folder.path().join("tty").to_str().unwrap());
     let program = pinion_path().parent().unwrap();
     let log = folder.path().join("log");
-    let mut shell = Command::new("sh")
+    let shell = Command::new("sh")
         .args(["-c", &recipe])
         .current_dir(&folder)
         .env("PATH", format!("{}:{}", program.display(), std::env::var("PATH").unwrap()))
         .stderr(fs::File::create(&log).unwrap())
-        .spawn()
-        .unwrap();
-    let end = Instant::now() + WAIT_MAX;
-    let status = loop {
-        if let Some(status) = shell.try_wait().unwrap() {
-            break status;
-        }
-        if Instant::now() >= end {
-            shell.kill().unwrap();
-            panic!("it does not end");
-        }
-        thread::sleep(Duration::from_millis(10));
-    };
+        .spawn();
+    let mut shell = Running(shell.unwrap());
+    let status = wait::until_some(|| shell.0.try_wait().unwrap(), || "its end".into());
     let log = fs::read_to_string(log).unwrap();
     assert_eq!(status.code(), Some(1), "{log}");
     assert!(log.contains("no_such_key"), "{log}");

@@ -3,14 +3,8 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
-use std::process::Output;
 
-use crate::process::{Pinion, exists, folder_with, output};
-
-fn text(output: &Output) -> (Option<i32>, String, String) {
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.code(), text(&output.stdout), text(&output.stderr))
-}
+use crate::process::{Pinion, exists, folder_with, output, printed, texts};
 
 /// `pinion run --check` with a file of this text, and more arguments.
 fn checked(config: &str, args: &[&str]) -> (Option<i32>, String, String) {
@@ -19,7 +13,7 @@ fn checked(config: &str, args: &[&str]) -> (Option<i32>, String, String) {
     let fixed = ["run", "--check", "--config", path.to_str().unwrap(), "-I", link.to_str().unwrap()];
     let checked = output(&[&fixed[..], args].concat());
     assert!(!exists(&link), "nothing is changed");
-    text(&checked)
+    texts(&checked)
 }
 
 #[test]
@@ -44,7 +38,7 @@ fn the_command_line_may_say_a_thing_twice_as_the_unit_and_its_options_do() {
     pinion.wait_for_link();
     assert_eq!(fs::metadata(pinion.link()).unwrap().permissions().mode() & 0o777, 0o640);
     let twice = output(&["run", "-r", "-w", "-r", "-w", "--check", "--board", "sim", "--cpu", "9", "--cpu", "100000"]);
-    let (_, out, _) = text(&twice);
+    let (_, out, _) = texts(&twice);
     assert!(out.contains("--cpu 100000: there is no such processor"), "{out}");
 }
 
@@ -64,7 +58,7 @@ fn a_file_with_a_mistake_is_not_served_and_the_mistake_is_shown() {
         let (code, _, log) = checked(config, &[]);
         assert!(code == Some(1) && log.contains(told), "{log}");
     }
-    let (code, _, log) = text(&output(&["run", "--config", "/nonexistent/pinion.toml"]));
+    let (code, _, log) = texts(&output(&["run", "--config", "/nonexistent/pinion.toml"]));
     assert!(code == Some(1) && log.contains("/nonexistent/pinion.toml: No such file"), "{log}");
 }
 
@@ -90,7 +84,7 @@ fn a_check_says_what_can_not_be_served() {
     assert!(out.contains("3 errors"), "{out}");
     let (folder, file) = folder_with("tty", "no link");
     let refused = output(&["run", "--check", "--board", "sim", "-I", file.to_str().unwrap()]);
-    let (code, out, _) = text(&refused);
+    let (code, out, _) = texts(&refused);
     assert!(code == Some(1) && out.contains(&format!("-> sudo rm {}", file.display())), "{out}");
     drop(folder);
 }
@@ -98,7 +92,7 @@ fn a_check_says_what_can_not_be_served() {
 #[test]
 fn a_bare_run_reads_no_file() {
     // Otherwise a file for the service would change a program that a user starts by hand.
-    let help = String::from_utf8(output(&["run", "--help"]).stdout).unwrap();
+    let help = printed(&["run", "--help"]);
     assert!(help.contains("--config <FILE>") && !help.contains("[default: /etc"), "{help}");
 }
 
@@ -116,7 +110,7 @@ fn a_description_from_elsewhere_opens_no_file() {
         &["sim", toml, "--print-config"],
         &["sim", toml, "--show"],
     ] {
-        let (code, out, log) = text(&output(args));
+        let (code, out, log) = texts(&output(args));
         assert_eq!(fs::read_to_string(&own).unwrap(), "keep", "{args:?} emptied the file");
         assert!(
             code == Some(1) && (out + &log).contains("printer.toml:3:1: unknown field `trace_file`"),

@@ -5,17 +5,18 @@ use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
-use std::process::{Command, ExitStatus, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 
 use nix::pty::openpty;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 
-use crate::process::{Pinion, folder_with, pinion_path, program};
+use crate::process::{Pinion, folder_with, pinion_path, program, texts};
 use crate::terminal::AtTerminal;
 
-fn console(args: &[&str], script: &str) -> Output {
+/// Runs a script in a console to its end: its status, its output and its log.
+fn console(args: &[&str], script: &str) -> (Option<i32>, String, String) {
     let mut child = Command::new(pinion_path())
         .arg("console")
         .args(args)
@@ -27,11 +28,7 @@ fn console(args: &[&str], script: &str) -> Output {
         .unwrap();
     // The console may have been refused before it reads.
     let _ = child.stdin.take().unwrap().write_all(script.as_bytes());
-    child.wait_with_output().unwrap()
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
+    texts(&child.wait_with_output().unwrap())
 }
 
 const OUTPUT: &str = "\
@@ -45,9 +42,8 @@ finalize_config crc=1
 fn a_script_configures_a_simulated_mcu_and_sets_an_output() {
     let script =
         format!("{OUTPUT}update_digital_out oid=0 value=1\nget_clock\nget_config\ndelay 0.1\nquit\nnonsense\n");
-    let output = console(&["--board", "sim"], &script);
-    let (out, log) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{out}\n{log}");
+    let (code, out, log) = console(&["--board", "sim"], &script);
+    assert_eq!(code, Some(0), "{out}\n{log}");
     assert!(out.contains("> update_digital_out oid=0 value=1\n"), "{out}");
     let clock = out.lines().find(|line| line.contains("] clock clock=")).unwrap();
     let (stamp, ticks) = clock.strip_prefix('[').unwrap().split_once("] clock clock=").unwrap();
@@ -60,40 +56,36 @@ fn a_script_configures_a_simulated_mcu_and_sets_an_output() {
 
 #[test]
 fn a_script_ends_at_its_first_error_and_tells_the_line() {
-    let output = console(&["--board", "sim"], "get_uptime\n\nget_clok\nget_uptime\n");
-    assert_eq!(output.status.code(), Some(1));
-    let log = text(&output.stderr);
+    let (code, out, log) = console(&["--board", "sim"], "get_uptime\n\nget_clok\nget_uptime\n");
+    assert_eq!(code, Some(1));
     assert!(log.contains("line 3: there is no command get_clok; did you mean get_clock?"), "{log}");
-    assert_eq!(text(&output.stdout).matches("] uptime ").count(), 1);
+    assert_eq!(out.matches("] uptime ").count(), 1);
 
     // The console stops reading at 1 MiB.
     let longest = "x".repeat((1 << 20) - 1);
     for (line, trouble) in [(format!("{longest}\n"), "it is too long"), (longest, "there is no command xxx")] {
-        let log = text(&console(&["--board", "sim"], &format!("get_uptime\n{line}")).stderr);
+        let (_, _, log) = console(&["--board", "sim"], &format!("get_uptime\n{line}"));
         assert!(log.contains(&format!("line 2: {trouble}")), "{}", &log[..log.len().min(300)]);
     }
 
     let (_folder, file) = folder_with("script", "get_uptime\nconfig_endstop oid=0 pin=x_endstp pull_up=1\n");
-    let output = console(&["--board", "sim", "-f", file.to_str().unwrap()], "");
-    let log = text(&output.stderr);
+    let (code, _, log) = console(&["--board", "sim", "-f", file.to_str().unwrap()], "");
     assert!(log.contains(&format!("{}: line 2: `x_endstp` is none", file.display())), "{log}");
     assert!(log.contains("did you mean x_endstop?"), "{log}");
-    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(code, Some(1));
 }
 
 #[test]
 fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
     let script = "allocate_oids count=1\nallocate_oids count=1\nget_clock\n";
-    let output = console(&["--board", "sim"], script);
-    let (out, log) = (text(&output.stdout), text(&output.stderr));
-    assert_eq!(output.status.code(), Some(1), "{out}\n{log}");
+    let (code, out, log) = console(&["--board", "sim"], script);
+    assert_eq!(code, Some(1), "{out}\n{log}");
     assert!(log.contains("line 2: the MCU shut down: oids already allocated"), "{log}");
     assert!(!out.contains("] clock "), "{out}");
     // A requested stop is not an error.
     let script = format!("{OUTPUT}emergency_stop\nreset\n{OUTPUT}get_config\n");
-    let output = console(&["--board", "sim"], &script);
-    let (out, log) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{out}\n{log}");
+    let (code, out, log) = console(&["--board", "sim"], &script);
+    assert_eq!(code, Some(0), "{out}\n{log}");
     assert!(out.contains("static_string_id=Command request\n"), "{out}");
     assert!(out.ends_with("] config is_config=1 crc=1 is_shutdown=0 move_count=1024\n"), "{out}");
 }
@@ -102,9 +94,8 @@ fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
 fn an_output_follows_an_instant_that_is_given_from_now() {
     // An output that is refreshed within two seconds stays. Then nobody refreshes it.
     let script =
-        format!("{OUTPUT}queue_digital_out oid=0 clock=@clock+0.2s on_ticks=1\ndelay 0.5\nget_config\ndelay 20\n");
-    let output = console(&["--board", "sim"], &script);
-    let (out, log) = (text(&output.stdout), text(&output.stderr));
+        format!("{OUTPUT}queue_digital_out oid=0 clock=@clock+1s on_ticks=1\ndelay 1.3\nget_config\ndelay 20\n");
+    let (_, out, log) = console(&["--board", "sim"], &script);
     assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0"), "{out}\n{log}");
     assert!(log.contains("line 8: the MCU shut down: Missed scheduling of next digital out event"), "{log}");
 }
@@ -114,29 +105,25 @@ fn a_running_mcu_is_spoken_to_and_one_with_a_host_is_not() {
     let pinion = Pinion::simulated(&[]);
     let link = pinion.link();
     let link = link.to_str().unwrap();
-    let output = console(&[link], "get_config\n");
-    assert!(output.status.success(), "{output:?}");
-    assert!(text(&output.stdout).contains("] config is_config=0 "), "{output:?}");
+    let (code, out, log) = console(&[link], "get_config\n");
+    assert!(code == Some(0) && out.contains("] config is_config=0 "), "{out}\n{log}");
     // Another process has the terminal open. This process's own client also counts as another process for the console.
     let mut client = pinion.client();
     Config::default().apply(&mut client).unwrap();
-    let refused = console(&[link], "emergency_stop\n");
-    assert_eq!(refused.status.code(), Some(1));
-    let log = text(&refused.stderr);
+    let (code, _, log) = console(&[link], "emergency_stop\n");
+    assert_eq!(code, Some(1));
     assert!(log.contains(&format!("process {} (", std::process::id())) && log.contains("stop it first"), "{log}");
     assert!(!client.status().unwrap().is_shutdown);
-    let missing = console(&["/tmp/no-such-link"], "");
-    assert!(text(&missing.stderr).contains("start Pinion, or name its link"), "{missing:?}");
+    let (_, _, log) = console(&["/tmp/no-such-link"], "");
+    assert!(log.contains("start Pinion, or name its link"), "{log}");
 }
 
 #[test]
 fn what_is_no_terminal_is_left_as_it_is() {
     let (_folder, file) = folder_with("passwd", "root:x:0:0:root:/root:/bin/bash\n");
     for path in [file.to_str().unwrap(), "/dev/null"] {
-        let refused = console(&[path], "get_config\n");
-        let log = text(&refused.stderr);
-        assert!(log.contains(&format!("{path} is no terminal")), "{log}");
-        assert_eq!(refused.status.code(), Some(1));
+        let (code, _, log) = console(&[path], "get_config\n");
+        assert!(code == Some(1) && log.contains(&format!("{path} is no terminal")), "{log}");
     }
     assert_eq!(fs::read_to_string(&file).unwrap(), "root:x:0:0:root:/root:/bin/bash\n");
 }
@@ -198,45 +185,28 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
         }
     }
     // The signal also ends a script.
-    let script = console_ended_by(Signal::SIGTERM);
+    let script = console_with(Signal::SIGTERM, program()).wait().unwrap();
     assert_eq!(script.signal(), Some(Signal::SIGTERM as i32), "{script}");
 }
 
-/// The exit status of a console that gets a signal during a script.
-fn console_ended_by(signal: Signal) -> ExitStatus {
-    let mut child = program()
-        .args(["console", "--board", "sim"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+/// A console that gets this signal after the first line of its script.
+fn console_with(signal: Signal, mut pinion: Command) -> Child {
+    pinion.args(["console", "--board", "sim"]).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut child = pinion.spawn().unwrap();
     child.stdin.as_mut().unwrap().write_all(b"get_uptime\n").unwrap();
-    let mut said = [0; 4];
-    child.stdout.as_mut().unwrap().read_exact(&mut said).unwrap();
+    child.stdout.as_mut().unwrap().read_exact(&mut [0; 4]).unwrap();
     kill(Pid::from_raw(child.id() as i32), signal).unwrap();
-    child.wait().unwrap()
+    child
 }
 
 #[test]
 fn started_by_nohup_it_outlives_its_terminal() {
-    let mut child = Command::new("nohup")
-        .arg(pinion_path())
-        .args(["console", "--board", "sim"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut stdin = child.stdin.take().unwrap();
-    stdin.write_all(b"get_uptime\n").unwrap();
-    let mut said = [0; 4];
-    child.stdout.as_mut().unwrap().read_exact(&mut said).unwrap();
-    kill(Pid::from_raw(child.id() as i32), Signal::SIGHUP).unwrap();
-    stdin.write_all(b"get_uptime\nget_config\nquit\n").unwrap();
-    let output = child.wait_with_output().unwrap();
-    assert!(output.status.success(), "{output:?}");
-    assert!(text(&output.stdout).contains("] config is_config="), "{output:?}");
+    let mut nohup = Command::new("nohup");
+    nohup.arg(pinion_path());
+    let mut child = console_with(Signal::SIGHUP, nohup);
+    child.stdin.take().unwrap().write_all(b"get_uptime\nget_config\nquit\n").unwrap();
+    let (code, out, _) = texts(&child.wait_with_output().unwrap());
+    assert!(code == Some(0) && out.contains("] config is_config="), "{out}");
 }
 
 #[test]
@@ -250,9 +220,8 @@ fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
         .spawn()
         .unwrap();
     File::from(terminal.master.try_clone().unwrap()).write_all(b"get_uptime\nquit\n").unwrap();
-    let output = child.wait_with_output().unwrap();
-    assert!(output.status.success(), "{output:?}");
-    assert!(text(&output.stdout).contains("] uptime high="), "{output:?}");
+    let (code, out, log) = texts(&child.wait_with_output().unwrap());
+    assert!(code == Some(0) && out.contains("] uptime high="), "{out}\n{log}");
 }
 
 #[test]

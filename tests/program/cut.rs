@@ -10,9 +10,9 @@ use nix::unistd::Pid;
 use pinion_client::Client;
 use serde_json::Value;
 
-use crate::links::{client, on_serial, plug_in, pull_out};
+use crate::links::{client, plug_in, plugged, pull_out};
 use crate::process::{Pinion, WAIT_MAX};
-use crate::ssh::{attached, near};
+use crate::ssh::{attached, pair};
 use crate::status::{line, status};
 
 /// How long a heater stays on that the host does not refresh. klippy's is 3 seconds (`MAX_HEAT_TIME`).
@@ -55,7 +55,7 @@ pub fn begin(host: &mut Client, heat_s: f64) {
     ] {
         host.send_line(command).unwrap();
     }
-    let start = host.clock_in(0.3).unwrap().wire();
+    let start = host.clock_in(1.0).unwrap().wire();
     let expires = start.wrapping_add(ticks(host, TRSYNC_S));
     let interval = ticks(host, STEP_S);
     for command in [
@@ -121,6 +121,13 @@ fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
     }
 }
 
+/// A host over SSH.
+fn over_ssh() -> (Pinion, Pinion, Client) {
+    let (mcu, near) = pair();
+    let host = near.client();
+    (mcu, near, host)
+}
+
 /// With a heater, and without one.
 fn is_cut(start: impl Fn() -> Wire + Sync) {
     thread::scope(|scope| {
@@ -144,9 +151,7 @@ fn next_over(near: &Pinion) -> Client {
 }
 
 fn serial() -> (Pinion, Client) {
-    let folder = tempfile::tempdir().unwrap();
-    let host = plug_in(&folder);
-    let mcu = on_serial(folder, "");
+    let (host, mcu) = plugged(&[]);
     mcu.logged("serving on");
     (mcu, client(host))
 }
@@ -184,9 +189,7 @@ fn a_serial_line_on_which_nothing_comes_any_more() {
 #[test]
 fn an_ssh_that_is_killed() {
     is_cut(|| {
-        let mcu = Pinion::simulated(&[]);
-        let near = near(&mcu.link(), "");
-        let host = near.client();
+        let (mcu, near, host) = over_ssh();
         let cut = |mcu: &Pinion, host: Client| -> Whole {
             let [pid] = attached(&mcu.link())[..] else { panic!("no attach, or several") };
             kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
@@ -200,9 +203,7 @@ fn an_ssh_that_is_killed() {
 #[test]
 fn an_ssh_that_carries_nothing_any_more() {
     is_cut(|| {
-        let mcu = Pinion::simulated(&[]);
-        let near = near(&mcu.link(), "");
-        let host = near.client();
+        let (mcu, near, host) = over_ssh();
         let cut = |_: &Pinion, host: Client| -> Whole {
             // The network is gone: neither side hears the other.
             near.signal(Signal::SIGSTOP);
@@ -218,9 +219,7 @@ fn an_ssh_that_carries_nothing_any_more() {
 
 #[test]
 fn a_host_that_hangs_behind_ssh_is_no_cut() {
-    let mcu = Pinion::simulated(&[]);
-    let near = near(&mcu.link(), "");
-    let mut host = near.client();
+    let (mcu, _near, mut host) = over_ssh();
     // `pinion link` sends a keepalive after two seconds of silence.
     begin(&mut host, 3.0 * HEAT_S);
     mcu.logged("shutdown: Missed scheduling of next digital out event");

@@ -5,9 +5,10 @@ use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, Output};
+use std::process::{Command, Output};
 
 use pinion_testkit::here;
+use pinion_testkit::process::Running;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -341,20 +342,10 @@ fn marks_that_turn_a_line_around_are_not_printed() {
     assert!(json.is_ascii() && json.contains("\\u202e"), "{json}");
 }
 
-/// Ends the process.
-struct False(Child);
-
-impl Drop for False {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 /// A process of this user with another name, for an hour.
-fn called(name: &str, uid: u32) -> False {
+fn called(name: &str, uid: u32) -> Running {
     let process = Command::new("sleep").arg0(name).arg("3600").uid(uid).gid(uid).spawn();
-    False(process.unwrap())
+    Running(process.unwrap())
 }
 
 #[test]

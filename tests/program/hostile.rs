@@ -5,9 +5,9 @@ use std::fs::{self, File};
 use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::Signal;
@@ -15,9 +15,11 @@ use nix::sys::termios::{FlowArg, InputFlags, LocalFlags, SetArg, tcflow, tcgetat
 use pinion_linux::sys;
 use pinion_protocol::block::{Sequence, frame};
 use pinion_protocol::vlq::Writer;
+use pinion_testkit::process::Running;
+use pinion_testkit::wait;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX, as_nobody, pinion_path, program};
+use crate::process::{Pinion, as_nobody, pinion_path, program};
 use crate::terminal::AtTerminal;
 
 /// A member of the terminal's group that has it open.
@@ -183,7 +185,7 @@ fn a_client_that_comes_and_goes_at_will_does_not_fill_the_log() {
 }
 
 /// Starts three programs at one link at once. Their processes and logs.
-fn three_at_once(folder: &TempDir) -> Vec<(Child, PathBuf)> {
+fn three_at_once(folder: &TempDir) -> Vec<(Running, PathBuf)> {
     let start = |number: usize| {
         let log = folder.path().join(format!("log{number}"));
         let child = Command::new(pinion_path())
@@ -194,7 +196,7 @@ fn three_at_once(folder: &TempDir) -> Vec<(Child, PathBuf)> {
             .env("STATE_DIRECTORY", folder.path())
             .stderr(File::create(&log).unwrap())
             .spawn();
-        (child.unwrap(), log)
+        (Running(child.unwrap()), log)
     };
     (0..3).map(start).collect()
 }
@@ -204,25 +206,17 @@ fn of_programs_that_start_at_one_link_at_once_exactly_one_serves() {
     for round in 0..8 {
         let folder = tempfile::tempdir().unwrap();
         let mut programs = three_at_once(&folder);
-        let end = Instant::now() + WAIT_MAX;
         let log = |path: &Path| fs::read_to_string(path).unwrap();
-        let is_decided = |(child, path): &mut (Child, PathBuf)| {
-            child.try_wait().unwrap().is_some() || log(path).contains("serving on")
+        let is_decided = |(child, path): &mut (Running, PathBuf)| {
+            child.0.try_wait().unwrap().is_some() || log(path).contains("serving on")
         };
-        while !programs.iter_mut().all(is_decided) {
-            assert!(Instant::now() < end, "round {round}");
-            thread::sleep(Duration::from_millis(10));
-        }
+        wait::until(&format!("round {round}"), || programs.iter_mut().all(is_decided));
         let logs = programs.iter().map(|(_, path)| log(path)).collect::<Vec<_>>().join("\n");
-        let (mut serving, mut refused): (Vec<_>, Vec<_>) =
+        let (serving, mut refused): (Vec<_>, Vec<_>) =
             programs.into_iter().partition(|(_, path)| log(path).contains("serving on"));
-        for (child, _) in &mut serving {
-            child.kill().unwrap();
-            child.wait().unwrap();
-        }
         assert_eq!(serving.len(), 1, "round {round}:\n{logs}");
         for (child, path) in &mut refused {
-            assert_eq!(child.wait().unwrap().code(), Some(1));
+            assert_eq!(child.0.wait().unwrap().code(), Some(1));
             // Not whose process it is: root's Pinion may not look into another one, and names the oldest at this link.
             assert!(log(path).contains("which Pinion serves (process "), "round {round}:\n{logs}");
         }
@@ -234,8 +228,7 @@ fn a_lock_on_the_links_folder_that_another_user_holds_prevents_no_start() {
     let folder = tempfile::tempdir().unwrap();
     let lock =
         nix::fcntl::Flock::lock(File::open(folder.path()).unwrap(), nix::fcntl::FlockArg::LockExclusive).unwrap();
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.logged("serving on");
+    let _pinion = Pinion::simulated_in(folder);
     drop(lock);
 }
 

@@ -4,9 +4,8 @@
 use std::fs;
 use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
-use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -21,15 +20,14 @@ use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
 
-use crate::process::{Pinion, WAIT_MAX, exists, output, program_in};
+use crate::process::{Pinion, WAIT_MAX, exists, output};
 
 #[test]
 fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
     let folder = tempfile::tempdir().unwrap();
     symlink("/dev/pts/no-longer-there", folder.path().join("tty")).unwrap();
-    let mut pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    let mut pinion = Pinion::simulated_in(folder);
     let link = pinion.link();
-    pinion.logged("serving on");
     assert!(fs::metadata(&link).is_ok(), "the link leads to a terminal");
     pinion.client();
     pinion.signal(Signal::SIGTERM);
@@ -87,8 +85,7 @@ fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_term
     killed.end();
     assert!(exists(&killed.link()), "it is left");
     let (folder, _) = killed.into_folder();
-    let mut pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.logged("serving on");
+    let mut pinion = Pinion::simulated_in(folder);
     pinion.client().status().unwrap();
     pinion.signal(Signal::SIGKILL);
     pinion.end();
@@ -100,8 +97,7 @@ fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_term
     fs::remove_file(&link).unwrap();
     symlink(ttyname(&login.slave).unwrap(), &link).unwrap();
     made_an_hour_ago(&link);
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.logged("serving on");
+    let pinion = Pinion::simulated_in(folder);
     pinion.client().status().unwrap();
 }
 
@@ -111,8 +107,7 @@ fn a_link_that_was_left_is_replaced_though_another_pinion_has_the_terminal_of_it
     other.logged("serving on");
     let folder = tempfile::tempdir().unwrap();
     symlink(fs::read_link(other.link()).unwrap(), folder.path().join("tty")).unwrap();
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.logged("serving on");
+    let pinion = Pinion::simulated_in(folder);
     pinion.client().status().unwrap();
     other.client().status().unwrap();
 }
@@ -187,24 +182,7 @@ fn a_link_in_a_folder_that_does_not_exist_is_refused_with_the_remedy() {
 
 #[test]
 fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
-    let folder = tempfile::tempdir().unwrap();
-    let program = program_in(folder.path());
-    let (link, log) = (folder.path().join("tty"), folder.path().join("log"));
-    fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
-    let mut command = Command::new(&program);
-    if nix::unistd::geteuid().is_root() {
-        command.uid(65534).gid(65534);
-    }
-    command.args(["run", "--board", "sim", "-I"]).arg(&link).stderr(fs::File::create(&log).unwrap());
-    let mut pinion = command.spawn().unwrap();
-    let end = Instant::now() + WAIT_MAX;
-    let log = || fs::read_to_string(&log).unwrap();
-    while !log().contains("serving on") {
-        assert!(Instant::now() < end && pinion.try_wait().unwrap().is_none(), "{}", log());
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    pinion.kill().unwrap();
-    pinion.wait().unwrap();
+    Pinion::start_as_nobody(&[]);
 }
 
 #[test]
@@ -232,10 +210,7 @@ fn force_shutdown_stops_the_mcu_and_a_reset_starts_it_anew() {
 #[test]
 fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
     let mut pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    client.send_line("allocate_oids count=1").unwrap();
-    client.send_line("config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0").unwrap();
-    client.send_line("finalize_config crc=1").unwrap();
+    let mut client = pinion.configured(&["config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0"]);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     client.link().settle().unwrap();
     pinion.signal(Signal::SIGTERM);
@@ -378,7 +353,7 @@ fn what_the_host_and_the_service_manager_ask_for_is_no_warning() {
 }
 
 /// A full pipe.
-fn full_pipe() -> (PipeReader, PipeWriter) {
+pub fn full_pipe() -> (PipeReader, PipeWriter) {
     let (reader, mut writer) = std::io::pipe().unwrap();
     fcntl(&writer, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
     while writer.write(&[b'.'; 4096]).is_ok() {}
@@ -386,12 +361,18 @@ fn full_pipe() -> (PipeReader, PipeWriter) {
     (reader, writer)
 }
 
-#[test]
-fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
+/// A simulated printer whose log goes into a full pipe.
+fn with_full_log() -> (PipeReader, Pinion) {
     let (reader, writer) = full_pipe();
     let folder = tempfile::tempdir().unwrap();
-    let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
+    let pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
     pinion.wait_for_link();
+    (reader, pinion)
+}
+
+#[test]
+fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
+    let (reader, mut pinion) = with_full_log();
     let mut client = pinion.client();
     Config::default().apply(&mut client).unwrap();
     client.reset().unwrap();
@@ -404,10 +385,7 @@ fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
 
 #[test]
 fn a_log_that_is_read_again_tells_how_much_of_it_was_left_out() {
-    let (reader, writer) = full_pipe();
-    let folder = tempfile::tempdir().unwrap();
-    let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
-    pinion.wait_for_link();
+    let (reader, mut pinion) = with_full_log();
     let mut client = pinion.client();
     // Each reset gives three log lines. Together that is more than the program writes.
     for _ in 0..200 {

@@ -7,8 +7,6 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
-use std::thread;
-use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
@@ -16,6 +14,7 @@ use nix::sys::signal::Signal;
 use nix::unistd::geteuid;
 use pinion_client::Client;
 use pinion_client::serial::{BlockLink, Port};
+use pinion_testkit::wait;
 use tempfile::TempDir;
 
 use crate::cut::begin;
@@ -43,9 +42,15 @@ pub fn client(host: impl Into<OwnedFd>) -> Client {
     Client::new(BlockLink::new(port, WAIT_MAX).unwrap()).unwrap()
 }
 
-pub fn on_serial(folder: TempDir, more: &str) -> Pinion {
-    let link = format!("serial:{}{more}", folder.path().join("ttyPort").display());
-    Pinion::start_in(folder, &["run", "--board", "sim", "--link", &link])
+fn on_serial(folder: TempDir, more: &[&str]) -> Pinion {
+    let link = format!("serial:{}", folder.path().join("ttyPort").display());
+    Pinion::start_in(folder, &[&["run", "--board", "sim", "--link", &link], more].concat())
+}
+
+/// The host's end of a serial line, and the program at the other end.
+pub fn plugged(more: &[&str]) -> (PtyMaster, Pinion) {
+    let folder = tempfile::tempdir().unwrap();
+    (plug_in(&folder), on_serial(folder, more))
 }
 
 fn uptime(client: &mut Client) {
@@ -56,7 +61,8 @@ fn uptime(client: &mut Client) {
 fn a_host_at_the_other_end_of_a_serial_line_is_served() {
     let folder = tempfile::tempdir().unwrap();
     let host = plug_in(&folder);
-    let pinion = on_serial(folder, ",500000");
+    let link = format!("serial:{},500000", folder.path().join("ttyPort").display());
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim", "--link", &link]);
     pinion.logged("ttyPort (500000 baud)");
     pinion.logged("it gets the union of v0.13, master and Kalico");
     let mut client = client(host);
@@ -76,9 +82,7 @@ fn a_host_at_the_other_end_of_a_serial_line_is_served() {
 
 #[test]
 fn a_serial_port_that_goes_and_comes_back_is_served_again() {
-    let folder = tempfile::tempdir().unwrap();
-    let host = plug_in(&folder);
-    let pinion = on_serial(folder, "");
+    let (host, pinion) = plugged(&[]);
     pinion.logged("ttyPort (250000 baud)");
     let mut first = client(host);
     uptime(&mut first);
@@ -93,9 +97,7 @@ fn a_serial_port_that_goes_and_comes_back_is_served_again() {
 
 #[test]
 fn a_host_that_is_silent_counts_as_gone_and_may_go_on() {
-    let folder = tempfile::tempdir().unwrap();
-    let host = plug_in(&folder);
-    let pinion = on_serial(folder, "");
+    let (host, pinion) = plugged(&[]);
     let mut client = client(host);
     uptime(&mut client);
     pinion.logged("host attached");
@@ -108,7 +110,7 @@ fn a_host_that_is_silent_counts_as_gone_and_may_go_on() {
 #[test]
 fn a_serial_port_that_is_not_there_yet_is_waited_for() {
     let folder = tempfile::tempdir().unwrap();
-    let pinion = on_serial(folder, "");
+    let pinion = on_serial(folder, &[]);
     pinion.logged("there is no ");
     pinion.logged("waiting for ");
     assert!(!pinion.log().contains("serving on"), "{}", pinion.log());
@@ -142,11 +144,9 @@ fn a_link_that_run_refuses_is_an_error_of_the_check() {
 
 #[test]
 fn a_port_whose_other_end_stays_is_free_after_a_kill() {
-    let folder = tempfile::tempdir().unwrap();
-    let host = plug_in(&folder);
-    let port = fs::canonicalize(folder.path().join("ttyPort")).unwrap();
-    let mut pinion = on_serial(folder, "");
+    let (host, mut pinion) = plugged(&[]);
     pinion.logged("serving on");
+    let port = fs::canonicalize(pinion.folder().path().join("ttyPort")).unwrap();
     pinion.signal(Signal::SIGKILL);
     pinion.end();
     // For root the kernel would make an exception.
@@ -162,9 +162,7 @@ fn a_port_whose_other_end_stays_is_free_after_a_kill() {
 
 #[test]
 fn a_serial_port_that_another_program_uses_is_an_error_of_one_line() {
-    let folder = tempfile::tempdir().unwrap();
-    let _host = plug_in(&folder);
-    let first = on_serial(folder, "");
+    let (_host, first) = plugged(&[]);
     first.logged("serving on");
     let port = format!("serial:{}", first.folder().path().join("ttyPort").display());
     let (status, log) = first.beside(&["run", "--board", "sim", "--link", &port], false);
@@ -233,19 +231,12 @@ fn a_person_s_terminal_is_no_wire_and_a_program_s_may_be() {
     // socat with its option `pty`: the log is not there.
     let log = folder.path().join("log");
     let _program = AtTerminal::start(&mut run(), 24, Some(fs::File::create(&log).unwrap().into()));
-    let end = Instant::now() + WAIT_MAX;
-    while !fs::read_to_string(&log).unwrap().contains("serving on standard input") {
-        assert!(Instant::now() < end, "{}", fs::read_to_string(&log).unwrap());
-        thread::sleep(Duration::from_millis(10));
-    }
+    wait::until("the program", || fs::read_to_string(&log).unwrap().contains("serving on standard input"));
 }
 
 #[test]
 fn an_older_host_on_another_computer_gets_the_dialect_that_is_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let host = plug_in(&folder);
-    let link = format!("serial:{}", folder.path().join("ttyPort").display());
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim", "--dialect", "v0.11", "--link", &link]);
+    let (host, pinion) = plugged(&["--dialect", "v0.11"]);
     pinion.logged("serving on");
     let client = client(host);
     // v0.11 knows no `app`.

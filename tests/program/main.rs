@@ -11,6 +11,7 @@ mod cut;
 mod dialects;
 mod disk;
 mod doctor;
+mod guardian;
 mod hostile;
 mod kiauh;
 mod life;

@@ -9,13 +9,13 @@ use std::path::PathBuf;
 use nix::sys::signal::Signal;
 use pinion_client::{Arg, Client, Error};
 
-use crate::process::{Pinion, WAIT_MAX, output};
+use crate::process::{Pinion, WAIT_MAX, printed};
 
 /// A printer with buses that need this time for a transfer, and the record of its first bus, a loop.
 fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let (toml, trace) = (folder.path().join("slow.toml"), folder.path().join("trace"));
-    let printer = String::from_utf8(output(&["sim", "--print-board"]).stdout).unwrap();
+    let printer = printed(&["sim", "--print-board"]);
     let slow = printer.replace(
         "name = \"spidev0.0\"\n",
         &format!("name = \"spidev0.0\"\ndelay_us = {}\ntrace_pins = [\"beeper\"]\n", 1000 * delay_ms),
@@ -30,21 +30,10 @@ fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
 
 const SPI: u8 = 0;
 const DISPLAY: &[&str] = &[
-    "allocate_oids count=2",
     "config_spi_without_cs oid=0",
     "spi_set_bus oid=0 spi_bus=spidev0.0 mode=0 rate=1000000",
     "config_digital_out oid=1 pin=beeper value=0 default_value=0 max_duration=0",
-    "finalize_config crc=1",
 ];
-
-fn configured(pinion: &Pinion) -> Client {
-    let mut client = pinion.client();
-    for line in DISPLAY {
-        client.send_line(line).unwrap();
-    }
-    assert!(client.status().unwrap().is_config);
-    client
-}
 
 /// Asks the device to send this number back.
 fn transfer(client: &mut Client, number: u8) -> Result<Vec<u8>, Error> {
@@ -66,7 +55,7 @@ fn heard(trace: &PathBuf) -> Vec<(String, String)> {
 #[track_caller]
 fn each_transfer_happens_once_and_has_its_own_answer(delay_ms: u64, count: u8) {
     let (pinion, trace) = slow_printer(delay_ms);
-    let mut client = configured(&pinion);
+    let mut client = pinion.configured(DISPLAY);
     for number in 0..count {
         assert_eq!(transfer(&mut client, number).unwrap(), [number]);
     }
@@ -89,7 +78,7 @@ fn transfers_of_400_ms_happen_once_and_have_their_own_answers() {
 #[test]
 fn a_display_sees_its_line_and_its_bytes_in_order() {
     let (pinion, trace) = slow_printer(4);
-    let mut client = configured(&pinion);
+    let mut client = pinion.configured(DISPLAY);
     for n in 0..60 {
         // Short messages share blocks. Each long message has its own block.
         let bytes = format!("{n:02x}").repeat(1 + n % 40);
@@ -113,7 +102,7 @@ fn a_display_sees_its_line_and_its_bytes_in_order() {
 #[test]
 fn the_clock_is_told_beside_a_slow_transfer() {
     let (pinion, _) = slow_printer(400);
-    let mut client = configured(&pinion);
+    let mut client = pinion.configured(DISPLAY);
     client.send_line("spi_transfer oid=0 data=2a").unwrap();
     let clocks = [(); 3].map(|()| client.query("get_clock", &[], "clock", None).unwrap().u32("clock").unwrap());
     assert!(client.take("spi_transfer_response", Some(SPI)).is_none(), "the transfer was over before the clock came");
@@ -126,7 +115,7 @@ fn the_clock_is_told_beside_a_slow_transfer() {
 /// An MCU with a bus that hangs, and a command that waits for the bus.
 fn hanging() -> (Pinion, Client) {
     let (pinion, trace) = slow_printer(60_000);
-    let mut client = configured(&pinion);
+    let mut client = pinion.configured(DISPLAY);
     client.send_line("spi_transfer oid=0 data=01").unwrap();
     client.send_line("update_digital_out oid=1 value=1").unwrap();
     // The answer shows that the MCU has also received the transfer.

@@ -5,13 +5,11 @@ use std::fs;
 
 use pinion_testkit::mistakes::{MISTAKES, PRINTER};
 
-use crate::process::{Pinion, folder_with};
+use crate::process::{Pinion, folder_with, texts};
 
 /// Runs `pinion` to its end: its exit code, its output and its log.
 fn output(args: &[&str]) -> (Option<i32>, String, String) {
-    let done = crate::process::output(args);
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (done.status.code(), text(&done.stdout), text(&done.stderr))
+    texts(&crate::process::output(args))
 }
 
 #[test]

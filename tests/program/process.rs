@@ -5,23 +5,20 @@ use std::fs::{self, File};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::process::{Command, ExitStatus, Stdio};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
 use pinion_client::serial::Port;
-use pinion_testkit::simulator;
+use pinion_testkit::process::Running;
+pub use pinion_testkit::wait::WAIT_MAX;
+use pinion_testkit::{simulator, wait};
 use tempfile::TempDir;
 
-/// Timeout of a test: long enough for any busy computer, because no test here measures speed.
-pub const WAIT_MAX: Duration = Duration::from_secs(120);
-
-/// A running `pinion`, ended on drop.
+/// A running `pinion`.
 pub struct Pinion {
-    child: Child,
+    child: Running,
     folder: TempDir,
 }
 
@@ -30,6 +27,13 @@ impl Pinion {
     pub fn simulated(args: &[&str]) -> Pinion {
         let pinion = Pinion::start(&[&["run", "--board", "sim"], args].concat());
         pinion.wait_for_link();
+        pinion
+    }
+
+    /// The same, in a prepared folder.
+    pub fn simulated_in(folder: TempDir) -> Pinion {
+        let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+        pinion.logged("serving on");
         pinion
     }
 
@@ -58,7 +62,7 @@ impl Pinion {
             .stderr(log)
             .spawn()
             .unwrap();
-        Pinion { child, folder }
+        Pinion { child: Running(child), folder }
     }
 
     /// `pinion run` on the simulated printer, as an ordinary user. The service is one, and root may do more.
@@ -69,7 +73,7 @@ impl Pinion {
         let mut command = Command::new(program_in(folder.path()));
         command.args(["run", "--board", "sim"]).args(args).arg("-I").arg(folder.path().join("tty"));
         let child = as_nobody(&mut command).env_remove("JOURNAL_STREAM").stderr(log).spawn().unwrap();
-        let pinion = Pinion { child, folder };
+        let pinion = Pinion { child: Running(child), folder };
         pinion.logged("serving on");
         pinion
     }
@@ -88,7 +92,7 @@ impl Pinion {
             .stderr(log)
             .spawn()
             .unwrap();
-        Pinion { child, folder }
+        Pinion { child: Running(child), folder }
     }
 
     /// Runs another `pinion` at the same link to its end. Returns its status and its log. `as_nobody` runs it as that
@@ -104,14 +108,14 @@ impl Pinion {
             command.uid(65534).gid(65534);
         }
         let child = command.env_remove("JOURNAL_STREAM").spawn().unwrap();
-        let status = Pinion { child, folder: tempfile::tempdir().unwrap() }.end();
+        let status = Pinion { child: Running(child), folder: tempfile::tempdir().unwrap() }.end();
         (status.code(), fs::read_to_string(log).unwrap())
     }
 
     /// The remains of a program that has ended: its folder, and its link there.
-    pub fn into_folder(mut self) -> (TempDir, PathBuf) {
+    pub fn into_folder(self) -> (TempDir, PathBuf) {
         let link = self.link();
-        (std::mem::replace(&mut self.folder, tempfile::tempdir().unwrap()), link)
+        (self.folder, link)
     }
 
     /// Its folder.
@@ -138,7 +142,7 @@ impl Pinion {
     }
 
     pub fn pid(&self) -> u32 {
-        self.child.id()
+        self.child.0.id()
     }
 
     /// The scheduling policy and the nice value of each of its threads with this name (proc_pid_stat(5), fields 41 and
@@ -164,21 +168,28 @@ impl Pinion {
     #[track_caller]
     pub fn logged(&self, text: &str) -> String {
         let line = || self.log().lines().rfind(|line| line.contains(text)).map(str::to_owned);
-        self.until(&format!("a log line with \"{text}\""), || line().is_some());
-        line().unwrap()
+        self.until_some(&format!("a log line with \"{text}\""), line)
     }
 
     #[track_caller]
     pub fn until(&self, what: &str, done: impl Fn() -> bool) {
-        let end = Instant::now() + WAIT_MAX;
-        while !done() {
-            assert!(Instant::now() < end, "waited in vain for {what}; the log:\n{}", self.log());
-            thread::sleep(Duration::from_millis(10));
-        }
+        self.until_some(what, || done().then_some(()));
+    }
+
+    #[track_caller]
+    fn until_some<T>(&self, what: &str, result: impl FnMut() -> Option<T>) -> T {
+        wait::until_some(result, || format!("{what}; the log:\n{}", self.log()))
     }
 
     pub fn client(&self) -> Client {
         Client::connect(&self.link(), WAIT_MAX).unwrap()
+    }
+
+    /// A client that has configured the MCU: see [`configure`].
+    pub fn configured(&self, lines: &[&str]) -> Client {
+        let mut client = self.client();
+        configure(&mut client, lines);
+        client
     }
 
     pub fn port(&self) -> Port {
@@ -191,14 +202,12 @@ impl Pinion {
 
     /// Waits for the program's end.
     pub fn end(&mut self) -> ExitStatus {
-        let end = Instant::now() + WAIT_MAX;
-        loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                return status;
-            }
-            assert!(Instant::now() < end, "the program does not end; the log:\n{}", self.log());
-            thread::sleep(Duration::from_millis(10));
-        }
+        let Pinion { child, folder } = self;
+        let log = folder.path().join("log");
+        wait::until_some(
+            || child.0.try_wait().unwrap(),
+            || format!("the program's end; the log:\n{}", fs::read_to_string(log).unwrap_or_default()),
+        )
     }
 
     /// Memory of the process in KiB, by its name in `/proc/PID/status`. `RssAnon` is its own memory, without files. It
@@ -211,11 +220,12 @@ impl Pinion {
     }
 }
 
-impl Drop for Pinion {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// Configures an MCU with these objects.
+pub fn configure(client: &mut Client, lines: &[&str]) {
+    client.send_line("allocate_oids count=8").unwrap();
+    lines.iter().for_each(|line| client.send_line(line).unwrap());
+    client.send_line("finalize_config crc=1").unwrap();
+    assert!(client.status().unwrap().is_config);
 }
 
 /// The program, with each signal at its default: `nohup make test &` would have it ignore some.
@@ -262,6 +272,17 @@ pub fn closed_pipe() -> std::io::PipeWriter {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     writer
+}
+
+/// The status of a program that has ended, and all that it printed and logged.
+pub fn texts(output: &std::process::Output) -> (Option<i32>, String, String) {
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
+}
+
+/// What `pinion` prints.
+pub fn printed(args: &[&str]) -> String {
+    String::from_utf8(output(args).stdout).unwrap()
 }
 
 /// Runs `pinion` to its end.

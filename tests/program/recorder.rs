@@ -13,13 +13,14 @@ use std::time::Duration;
 
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
-use pinion_client::Client;
 use pinion_protocol::block::{Refusal, Sequence, frame};
 use pinion_testkit::here;
 use pinion_trace::event::Event;
 use pinion_trace::file::{End, Trace};
 
-use crate::process::{Pinion, WAIT_MAX, pinion_path};
+use crate::guardian::guardian;
+use crate::process::{Pinion, WAIT_MAX, configure, pinion_path};
+use crate::search::is_gone;
 
 /// The user `nobody`.
 const NOBODY: u32 = 65534;
@@ -32,13 +33,6 @@ fn kept(pinion: &Pinion) -> Vec<PathBuf> {
 
 fn read(path: &PathBuf) -> Trace {
     Trace::read(File::open(path).unwrap()).unwrap()
-}
-
-fn configure(client: &mut Client, lines: &[&str]) {
-    client.send_line("allocate_oids count=8").unwrap();
-    lines.iter().for_each(|line| client.send_line(line).unwrap());
-    client.send_line("finalize_config crc=1").unwrap();
-    assert!(client.status().unwrap().is_config);
 }
 
 const OUTPUT: &str = "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0";
@@ -58,8 +52,7 @@ fn verdict(pinion: &Pinion, words: &str) -> Trace {
 #[test]
 fn a_host_that_is_late_is_named() {
     let pinion = Pinion::simulated(&["--trace-edges"]);
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     let late = client.clock_in(-2.0).unwrap().wire();
     client.send_line(&format!("queue_digital_out oid=0 clock={late} on_ticks=1")).unwrap();
@@ -88,8 +81,7 @@ fn a_host_that_is_late_is_named() {
 #[test]
 fn a_stop_leaves_no_memory_behind() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     (0..20_000).for_each(|_| client.send_line("debug_nop").unwrap());
     client.status().unwrap();
     let before = pinion.memory_kib("RssAnon");
@@ -102,8 +94,7 @@ fn a_stop_leaves_no_memory_behind() {
 #[test]
 fn a_program_that_was_stopped_is_told_from_a_late_host() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     pinion.signal(Signal::SIGSTOP);
     thread::sleep(Duration::from_millis(1500));
     pinion.signal(Signal::SIGCONT);
@@ -117,7 +108,7 @@ fn a_program_that_was_stopped_is_told_from_a_late_host() {
 fn a_program_that_was_killed_leaves_its_trace() {
     let pinion = Pinion::start(&["run"]);
     pinion.wait_for_link();
-    configure(&mut pinion.client(), &[]);
+    pinion.configured(&[]);
     pinion.signal(Signal::SIGKILL);
     let trace = verdict(&pinion, "Pinion died");
     assert_eq!(trace.head.end, End::Died);
@@ -129,22 +120,22 @@ fn a_program_that_was_killed_leaves_its_trace() {
 #[test]
 fn a_normal_end_and_an_unused_program_leave_no_trace() {
     let mut pinion = Pinion::simulated(&[]);
-    configure(&mut pinion.client(), &[OUTPUT]);
+    pinion.configured(&[OUTPUT]);
     pinion.signal(Signal::SIGTERM);
     pinion.end();
     assert!(kept(&pinion).is_empty());
-    let mut pinion = Pinion::start(&["run"]);
+    let pinion = Pinion::start(&["run"]);
     pinion.wait_for_link();
+    let guardian = guardian(&pinion);
     pinion.signal(Signal::SIGKILL);
-    pinion.end();
-    thread::sleep(Duration::from_millis(300));
+    pinion.until("the end of the guardian, which would keep it", || is_gone(guardian));
     assert!(kept(&pinion).is_empty());
 }
 
 #[test]
 fn a_running_program_gives_its_recording() {
     let pinion = Pinion::simulated(&[]);
-    configure(&mut pinion.client(), &[OUTPUT]);
+    pinion.configured(&[OUTPUT]);
     pinion.until("the MCU's names", || {
         let live = UnixStream::connect(pinion.link().with_extension("trace")).unwrap();
         let trace = Trace::read(live).unwrap();
@@ -188,10 +179,8 @@ fn the_links_answers_and_what_it_refuses_are_recorded() {
 fn a_folder_that_takes_no_file_is_a_warning() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("state"), "no folder").unwrap();
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.wait_for_link();
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let pinion = Pinion::simulated_in(folder);
+    let mut client = pinion.configured(&[OUTPUT]);
     client.send_line("emergency_stop").unwrap();
     pinion.logged("nobody was late");
     pinion.logged("the trace of this stop is not kept: ");
@@ -210,11 +199,9 @@ fn root_writes_nothing_into_a_folder_of_another_user() {
     fs::create_dir(&state).unwrap();
     chown(&state, Some(NOBODY), None).unwrap();
     fs::write(&victim, "root's").unwrap();
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.wait_for_link();
+    let pinion = Pinion::simulated_in(folder);
     symlink(&victim, state.join(format!(".tty.{}", pinion.pid()))).unwrap();
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     client.send_line("emergency_stop").unwrap();
     pinion.logged("nobody was late");
     assert_eq!(fs::read(&victim).unwrap(), b"root's");
@@ -226,8 +213,7 @@ fn root_writes_nothing_into_a_folder_of_another_user() {
 #[test]
 fn clients_that_do_not_read_keep_no_stop_from_its_recording() {
     let pinion = Pinion::simulated(&["--trace-edges"]);
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     let ask = || UnixStream::connect(pinion.link().with_extension("trace")).unwrap();
     let read = |mut stream: UnixStream| {
         let mut bytes = Vec::new();
@@ -259,8 +245,7 @@ fn clients_that_do_not_read_keep_no_stop_from_its_recording() {
 #[test]
 fn restarts_remove_no_recording_of_a_failure() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let mut client = pinion.configured(&[OUTPUT]);
     let late = client.clock_in(-2.0).unwrap().wire();
     client.send_line(&format!("queue_digital_out oid=0 clock={late} on_ticks=1")).unwrap();
     client.wait_shutdown(WAIT_MAX).unwrap();
@@ -285,10 +270,8 @@ fn a_recording_with_a_time_in_the_future_is_not_the_newest_for_ever() {
     let folder = tempfile::tempdir().unwrap();
     fs::create_dir(folder.path().join("state")).unwrap();
     fs::write(folder.path().join("state/tty-99981122T142614.321Z.trace"), "x").unwrap();
-    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
-    pinion.wait_for_link();
-    let mut client = pinion.client();
-    configure(&mut client, &[OUTPUT]);
+    let pinion = Pinion::simulated_in(folder);
+    let mut client = pinion.configured(&[OUTPUT]);
     client.send_line("emergency_stop").unwrap();
     pinion.logged("(pinion trace ");
     let mut newest = Command::new(pinion_path());

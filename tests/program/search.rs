@@ -26,7 +26,8 @@ pub fn search_of(pid: u32) -> Option<u32> {
     pids.into_iter().find(is_it)
 }
 
-fn is_gone(pid: u32) -> bool {
+/// Whether the process has ended.
+pub fn is_gone(pid: u32) -> bool {
     // An orphan's zombie may wait for an init that does not collect it.
     fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| stat.contains(") Z "))
 }

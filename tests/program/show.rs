@@ -2,7 +2,6 @@
 //! `pinion sim --show`: the output while a host drives the printer.
 
 use std::fs::File;
-use std::io::Write;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -11,23 +10,19 @@ use nix::sys::signal::Signal;
 use pinion_client::Client;
 use tempfile::TempDir;
 
-use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output, pinion_path};
+use crate::life::full_pipe;
+use crate::process::{Pinion, WAIT_MAX, closed_pipe, configure, exists, output, pinion_path, printed};
 use crate::terminal::AtTerminal;
 
 const STRIP: &[&str] = &[
-    "allocate_oids count=2",
     "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0",
     "config_neopixel oid=1 pin=spidev3.0 data_size=24 bit_max_ticks=200 reset_min_ticks=2500",
-    "finalize_config crc=1",
 ];
 
 /// Switches the light on, and the strip's first two lights to red and a dark blue.
 fn drive(link: &Path) -> Client {
     let mut client = Client::connect(link, WAIT_MAX).unwrap();
-    for line in STRIP {
-        client.send_line(line).unwrap();
-    }
-    assert!(client.status().unwrap().is_config);
+    configure(&mut client, STRIP);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     client.send_line("neopixel_update oid=1 pos=0 data=00ff00000020").unwrap();
     client.send_line("neopixel_send oid=1").unwrap();
@@ -37,8 +32,6 @@ fn drive(link: &Path) -> Client {
 #[test]
 fn each_change_is_a_line() {
     let mut pinion = Pinion::start(&["sim", "-r", "--show"]);
-    pinion.until("all things once", || pinion.out().contains("] dots: "));
-    let first = pinion.out();
     for line in [
         "x: 60.00 mm",
         "axis extruder: 0.00 mm",
@@ -47,7 +40,9 @@ fn each_change_is_a_line() {
         "light: off",
         "display: dark",
     ] {
-        assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
+        pinion.until(line, || pinion.out().contains(&format!("] {line}\n")));
+        let shown = pinion.out();
+        assert_eq!(shown.matches(&format!("] {line}\n")).count(), 1, "{line}\n{shown}");
     }
     assert!(matches!(pinion.scheduling("show")[..], [(0, _)]), "to show something is no hurry (SCHED_OTHER)");
     let mut client = drive(&pinion.link());
@@ -168,8 +163,7 @@ fn a_reader_that_goes_away_leaves_the_printer_serving() {
 #[test]
 fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
     // A pipe without a reader fills up.
-    let (_reader, writer) = std::io::pipe().unwrap();
-    fill(&writer);
+    let (_reader, writer) = full_pipe();
     let folder = tempfile::tempdir().unwrap();
     let log = File::create(folder.path().join("log")).unwrap();
     let mut pinion = Pinion::start_to(folder, &["sim", "--show"], writer, log);
@@ -180,20 +174,11 @@ fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
     assert_eq!(pinion.end().code(), Some(0));
 }
 
-/// Fills a pipe.
-fn fill(pipe: &std::io::PipeWriter) {
-    use nix::fcntl::{FcntlArg, OFlag, fcntl};
-    fcntl(pipe, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
-    let mut pipe_end = pipe.try_clone().unwrap();
-    while pipe_end.write(&[b' '; 4096]).is_ok() {}
-    fcntl(pipe, FcntlArg::F_SETFL(OFlag::empty())).unwrap();
-}
-
 #[test]
 fn to_show_and_to_demonstrate_exclude_each_other() {
     let refused = output(&["sim", "--show", "--demo"]);
     assert_eq!(refused.status.code(), Some(2));
-    let help = String::from_utf8(output(&["sim", "--help"]).stdout).unwrap();
+    let help = printed(&["sim", "--help"]);
     let words: Vec<&str> = help.split_whitespace().collect();
     assert!(
         words.join(" ").contains("--show Show the printer while a host drives it, instead of the demonstration"),

@@ -34,11 +34,18 @@ fn fake_ssh(folder: &Path, before: &str) -> PathBuf {
 }
 
 /// `pinion link` to a Pinion of this computer.
-pub fn near(remote: &Path, before: &str) -> Pinion {
+fn near(remote: &Path, before: &str) -> Pinion {
     let folder = tempfile::tempdir().unwrap();
     let ssh = fake_ssh(folder.path(), before);
     let link = ["link", "pi@toolhead", "--ssh", ssh.to_str().unwrap(), "--remote", remote.to_str().unwrap()];
     Pinion::start_in(folder, &link)
+}
+
+/// A simulated printer, and `pinion link` to it.
+pub fn pair() -> (Pinion, Pinion) {
+    let far = Pinion::simulated(&[]);
+    let near = near(&far.link(), "");
+    (far, near)
 }
 
 fn uptime(client: &mut Client) {
@@ -63,8 +70,7 @@ fn times(pinion: &Pinion, line: &str, count: usize) {
 
 #[test]
 fn a_host_is_carried_to_the_other_computer_and_each_sees_the_other_go() {
-    let far = Pinion::simulated(&[]);
-    let near = near(&far.link(), "");
+    let (far, near) = pair();
     near.logged("connected to pi@toolhead within");
     let mut client = near.client();
     uptime(&mut client);
@@ -85,8 +91,7 @@ fn a_host_is_carried_to_the_other_computer_and_each_sees_the_other_go() {
 
 #[test]
 fn a_host_sees_that_the_connection_is_lost_and_the_next_one_is_served() {
-    let far = Pinion::simulated(&[]);
-    let near = near(&far.link(), "");
+    let (far, near) = pair();
     let mut client = near.client();
     uptime(&mut client);
     let [pid] = attached(&far.link())[..] else { panic!("no attach, or several") };
@@ -104,8 +109,7 @@ fn a_host_sees_that_the_connection_is_lost_and_the_next_one_is_served() {
 
 #[test]
 fn a_service_that_is_started_anew_is_found_again() {
-    let mut far = Pinion::simulated(&[]);
-    let near = near(&far.link(), "");
+    let (mut far, near) = pair();
     let mut client = near.client();
     uptime(&mut client);
     far.signal(Signal::SIGTERM);
@@ -140,8 +144,7 @@ fn what_is_wrong_is_one_line_with_a_remedy() {
 
 #[test]
 fn a_terminal_is_for_one_host_only() {
-    let far = Pinion::simulated(&[]);
-    let near_one = near(&far.link(), "");
+    let (far, near_one) = pair();
     near_one.logged("connected to");
     let near_two = near(&far.link(), "");
     let line = near_two.logged("open: stop it first");
@@ -205,8 +208,7 @@ fn an_attach_gives_its_pipes_back_as_they_were() {
 
 #[test]
 fn a_person_stops_the_far_mcu_by_a_shell() {
-    let far = Pinion::simulated(&[]);
-    let near = near(&far.link(), "");
+    let (far, near) = pair();
     near.logged("connected to");
     fs::OpenOptions::new().write(true).open(near.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
     far.logged("FORCE_SHUTDOWN was written");
@@ -214,8 +216,7 @@ fn a_person_stops_the_far_mcu_by_a_shell() {
 
 #[test]
 fn the_end_takes_the_link_away_and_ends_ssh() {
-    let far = Pinion::simulated(&[]);
-    let mut near = near(&far.link(), "");
+    let (far, mut near) = pair();
     uptime(&mut near.client());
     near.signal(Signal::SIGTERM);
     assert_eq!(near.end().code(), Some(0), "{}", near.log());

@@ -15,13 +15,14 @@ use std::time::Instant;
 use nix::sys::signal::Signal;
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{FlowArg, tcflow};
-use pinion_testkit::here;
+use pinion_testkit::process::Running;
+use pinion_testkit::{here, wait};
 use serde_json::{Value, json};
 
-use crate::process::{Pinion, WAIT_MAX, as_nobody, exists, output, pinion_path, program_in};
+use crate::process::{Pinion, WAIT_MAX, as_nobody, exists, pinion_path, printed, program_in};
 use crate::terminal::AtTerminal;
 
-fn socket(pinion: &Pinion) -> PathBuf {
+pub fn socket(pinion: &Pinion) -> PathBuf {
     pinion.link().with_file_name("tty.sock")
 }
 
@@ -42,12 +43,10 @@ pub fn line<'a>(status: &'a Value, pin: &str) -> &'a Value {
 }
 
 const CONFIGURATION: &[&str] = &[
-    "allocate_oids count=4",
     "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0",
     "config_endstop oid=1 pin=x_endstop pull_up=1",
     "config_analog_in oid=2 pin=bed_sensor",
     "config_stepper oid=3 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
-    "finalize_config crc=1",
 ];
 
 #[test]
@@ -58,19 +57,16 @@ fn an_mcu_tells_how_it_is_in_each_state() {
     let waiting = status(&pinion);
     assert_eq!(waiting["state"], "waiting");
     assert_eq!(waiting["pid"], pinion.pid());
-    let version = String::from_utf8(output(&["--version"]).stdout).unwrap();
+    let version = printed(&["--version"]);
     assert_eq!(waiting["version"], version.trim().strip_prefix("pinion ").unwrap(), "the build's, not the package's");
     assert_eq!(waiting["link"], pinion.link().to_str().unwrap());
     assert_eq!((&waiting["host"]["attached"], &waiting["shutdown"]), (&json!(false), &Value::Null));
     assert_eq!(waiting["guardian"]["present"], false, "the simulated printer needs none");
     assert_eq!(waiting["dialect"], "master");
 
-    let mut client = pinion.client();
-    for command in CONFIGURATION {
-        client.send_line(command).unwrap();
-    }
+    let mut client = pinion.configured(CONFIGURATION);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
-    let clock = client.clock_in(0.1).unwrap().wire();
+    let clock = client.clock_in(1.0).unwrap().wire();
     // An edge, for which the core must be awake.
     client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
     client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
@@ -109,7 +105,9 @@ fn an_mcu_tells_how_it_is_in_each_state() {
     assert!(logged.ends_with(stopped["shutdown"]["detail"].as_str().unwrap()), "{logged}\n{stopped}");
     assert_eq!(line(&stopped, "led")["level"], 0);
     let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
-    assert!(page.contains("SHUT DOWN 0 s ago: Command request: ") || page.contains("SHUT DOWN 1 s ago"), "{page}");
+    let (_, since) = page.split_once("SHUT DOWN ").unwrap_or_else(|| panic!("{page}"));
+    let (seconds, reason) = since.split_once(" s ago: ").unwrap_or_else(|| panic!("{page}"));
+    assert!(seconds.parse::<u32>().is_ok() && reason.starts_with("Command request: "), "{page}");
     let metrics = String::from_utf8(ask(&pinion, &["--prometheus"]).stdout).unwrap();
     assert!(metrics.contains("\npinion_state{state=\"shutdown\"} 1\n"), "{metrics}");
 
@@ -140,16 +138,13 @@ fn each_of_two_instances_has_a_socket_and_none_takes_the_others() {
 
 #[test]
 fn what_a_killed_instance_left_is_replaced() {
-    let mut first = Pinion::simulated(&[]);
     let kept = tempfile::tempdir().unwrap();
     let path = kept.path().join("s.sock");
     drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
-    let second = Pinion::simulated(&["--socket", path.to_str().unwrap()]);
-    second.logged("status on");
+    let pinion = Pinion::simulated(&["--socket", path.to_str().unwrap()]);
+    pinion.logged("status on");
     assert!(fs::metadata(&path).unwrap().file_type().is_socket());
     UnixStream::connect(&path).unwrap();
-    first.signal(Signal::SIGTERM);
-    first.end();
 }
 
 #[test]
@@ -157,11 +152,7 @@ fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
     let pinion = Pinion::simulated(&[]);
     let path = socket(&pinion);
     pinion.until("the socket", || exists(&path));
-    let mut client = pinion.client();
-    for command in CONFIGURATION {
-        client.send_line(command).unwrap();
-    }
-    assert!(client.status().unwrap().is_config);
+    let mut client = pinion.configured(CONFIGURATION);
     // None of these clients reads, some send data, some leave at once.
     let mut silent = Vec::new();
     for n in 0..200 {
@@ -242,10 +233,7 @@ fn keys_that_arrive_together_all_count() {
 #[test]
 fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    for command in CONFIGURATION {
-        client.send_line(command).unwrap();
-    }
+    let mut client = pinion.configured(CONFIGURATION);
     client.emergency_stop().unwrap();
     let detail = status(&pinion)["shutdown"]["detail"].as_str().unwrap().to_owned();
     let mut watch = AtTerminal::start(&mut watch(&pinion), 60, None);
@@ -265,11 +253,8 @@ fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
 #[test]
 fn what_is_measured_is_first_and_pins_are_last() {
     let pinion = Pinion::simulated(&["--dialect", "master"]);
-    let mut client = pinion.client();
-    for command in CONFIGURATION {
-        client.send_line(command).unwrap();
-    }
-    let clock = client.clock_in(0.1).unwrap().wire();
+    let mut client = pinion.configured(CONFIGURATION);
+    let clock = client.clock_in(1.0).unwrap().wire();
     client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
     assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
     let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
@@ -288,26 +273,19 @@ fn the_folder_is_the_one_that_takes_recordings() {
     fs::write(&none, "").unwrap();
     fs::create_dir(&state).unwrap();
     let link = folder.path().join("tty");
-    let mut child = Command::new(pinion_path())
+    let child = Command::new(pinion_path())
         .args(["run", "--board", "sim", "-I"])
         .arg(&link)
         .env("STATE_DIRECTORY", format!("{}:{}", none.display(), state.display()))
         .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let socket = link.with_file_name("tty.sock");
-    let end = Instant::now() + WAIT_MAX;
-    while !exists(&socket) && Instant::now() < end {
-        thread::sleep(std::time::Duration::from_millis(10));
-    }
+        .spawn();
+    let _child = Running(child.unwrap());
+    wait::until("the socket", || exists(&link.with_file_name("tty.sock")));
     let asked = Command::new(pinion_path()).args(["status", "--json", "-I"]).arg(&link).output().unwrap();
-    let _ = child.kill();
-    let _ = child.wait();
     let status: Value = serde_json::from_slice(&asked.stdout).unwrap();
     assert_eq!(status["recorder"]["folder"], state.to_str().unwrap());
 }
 
-/// Other clients also ask, more than fit into the socket's queue.
 /// Any user can make such a link in /tmp, where the socket is if nobody has made a better place.
 #[test]
 fn a_link_to_another_socket_makes_nobody_a_member_of_its_group() {
@@ -331,6 +309,7 @@ fn a_link_to_another_socket_makes_nobody_a_member_of_its_group() {
     );
 }
 
+/// Other clients also ask, more than fit into the socket's queue.
 #[test]
 fn a_crowd_is_waited_for_and_then_named() {
     let folder = tempfile::tempdir().unwrap();
@@ -387,11 +366,7 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
     watch.until("\x1b[?1049l");
     let stat = format!("/proc/{}/stat", watch.pid());
     let is_stopped = || fs::read_to_string(&stat).unwrap().rsplit_once(") ").unwrap().1.starts_with('T');
-    let end = Instant::now() + WAIT_MAX;
-    while !is_stopped() {
-        assert!(Instant::now() < end);
-        thread::sleep(std::time::Duration::from_millis(10));
-    }
+    wait::until("the stop", is_stopped);
     assert!(watch.is_given_back());
     watch.signal(Signal::SIGCONT);
     watch.until("\x1b[?1049h");
@@ -433,9 +408,5 @@ fn watching_into_a_pipe_is_a_page_each_second() {
     assert!(!shown.contains('\x1b'));
     // It ends when its reader has gone.
     drop(out);
-    let end = Instant::now() + WAIT_MAX;
-    while watch.try_wait().unwrap().is_none() {
-        assert!(Instant::now() < end);
-        thread::sleep(std::time::Duration::from_millis(20));
-    }
+    wait::until("its end", || watch.try_wait().unwrap().is_some());
 }

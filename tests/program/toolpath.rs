@@ -4,20 +4,16 @@
 use std::fs;
 use std::net::TcpListener;
 use std::os::unix::fs::symlink;
-use std::thread;
-use std::time::Duration;
 
 use nix::sys::signal::Signal;
+use pinion_testkit::wait;
 
 use crate::process::{Pinion, folder_with, limited, output};
 
-/// Moves the x axis forward by 200 steps of 1/80 mm.
-const MOVE: &[&str] = &[
-    "allocate_oids count=2",
+/// The x axis, with 80 steps per millimeter.
+const X_AXIS: &[&str] = &[
     "config_stepper oid=0 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
     "config_digital_out oid=1 pin=x_enable value=0 default_value=0 max_duration=0",
-    "finalize_config crc=1",
-    "set_next_step_dir oid=0 dir=1",
 ];
 
 #[test]
@@ -31,12 +27,15 @@ fn the_path_is_written_when_the_program_ends() {
         let path = folder.path().join(name);
         let mut pinion = Pinion::start_in(folder, &["sim", "--toolpath", path.to_str().unwrap()]);
         pinion.wait_for_link();
-        let mut client = pinion.client();
-        MOVE.iter().for_each(|line| client.send_line(line).unwrap());
-        let clock = client.clock_in(0.2).unwrap().wire();
+        let mut client = pinion.configured(X_AXIS);
+        client.send_line("set_next_step_dir oid=0 dir=1").unwrap();
+        let clock = client.clock_in(1.0).unwrap().wire();
         client.send_line(&format!("reset_step_clock oid=0 clock={clock}")).unwrap();
         client.send_line("queue_step oid=0 interval=25000 count=200 add=0").unwrap();
-        thread::sleep(Duration::from_millis(800));
+        wait::until("the end of the move", || {
+            let position = client.query("stepper_get_position", &[("oid", 0_u8.into())], "stepper_position", Some(0));
+            position.unwrap().int("pos").unwrap() == 200
+        });
         drop(client);
         pinion.signal(signal);
         assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());

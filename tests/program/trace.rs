@@ -159,15 +159,13 @@ fn files_for_other_programs_are_written() {
 }
 
 /// A motor, a heater and a fan run until the host stops the MCU.
-const RUNNING: [&str; 8] = [
-    "allocate_oids count=6",
+const RUNNING: [&str; 6] = [
     "config_stepper oid=0 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
     "config_digital_out oid=1 pin=x_enable value=1 default_value=1 max_duration=0",
     "config_digital_out oid=2 pin=hotend_heater value=0 default_value=0 max_duration=0",
     "config_digital_out oid=3 pin=fan value=0 default_value=0 max_duration=0",
     "config_digital_out oid=4 pin=led value=0 default_value=1 max_duration=0",
     "config_buttons oid=5 button_count=1",
-    "finalize_config crc=1",
 ];
 
 /// The last value and the last change of each wire in a VCD.
@@ -188,9 +186,7 @@ fn wires(vcd: &str) -> HashMap<String, (char, u64)> {
 #[test]
 fn all_exports_show_what_the_stop_did() {
     let pinion = Pinion::simulated(&["--trace-edges"]);
-    let mut client = pinion.client();
-    RUNNING.iter().for_each(|line| client.send_line(line).unwrap());
-    assert!(client.status().unwrap().is_config);
+    let mut client = pinion.configured(&RUNNING);
     let ack = "buttons_ack oid=%c count=%c";
     assert!(client.dictionary().commands[ack].as_i64().unwrap() < 0, "it does not test negative ids");
     for _ in 0..9 {

@@ -324,6 +324,35 @@ impl Rig {
         responses.pop().map(|response| response.split_once("static_string_id=").unwrap().1.into())
     }
 
+    /// Runs the MCU up to the time `ticks`, inclusive. These must be its responses since the last call.
+    #[track_caller]
+    pub fn sends_until(&mut self, ticks: u64, responses: &[&str]) {
+        self.run_until(ticks);
+        assert_eq!(self.responses(), responses, "until {ticks}");
+    }
+
+    /// Runs the MCU up to the time `ticks`, inclusive. By then it must have shut down with this text.
+    #[track_caller]
+    pub fn stops_by(&mut self, ticks: u64, text: &str) {
+        self.run_until(ticks);
+        assert_eq!(self.shutdown().as_deref(), Some(text), "by {ticks}");
+    }
+
+    /// Configures these objects. One of them must shut the MCU down with this text.
+    #[track_caller]
+    pub fn refuses(&mut self, objects: &[&str], text: &str) {
+        self.send("allocate_oids count=20");
+        self.send_all(objects);
+        assert_eq!(self.shutdown().as_deref(), Some(text), "{objects:?}");
+    }
+
+    /// Sends a command that must shut the MCU down with this text.
+    #[track_caller]
+    pub fn stops_on(&mut self, command: &str, text: &str) {
+        self.send(command);
+        assert_eq!(self.shutdown().as_deref(), Some(text), "{command}");
+    }
+
     /// The edges of an output so far.
     pub fn edges(&self, pin: u32) -> Vec<Edge> {
         self.bench.edges(pin)

@@ -10,6 +10,7 @@
 //! - [`simulator`]: the program `pinion-sim`
 //! - [`markdown`]: the pages for users, and the blocks in them
 //! - [`mistakes`]: a printer.cfg, and mistakes in it
+//! - [`wait`]: how a test waits for another thread or process
 
 #![forbid(unsafe_code)]
 
@@ -29,6 +30,7 @@ pub mod names;
 pub mod process;
 pub mod simulator;
 pub mod tools;
+pub mod wait;
 
 /// A file's error, with what failed on which path.
 fn describe(action: &str, path: &Path, error: &io::Error) -> String {

@@ -56,3 +56,13 @@ pub fn pipeline(script: &str, words: &[&str]) -> Result<(), String> {
     bash.args(["-o", "pipefail", "-euc", script, "tests"]).args(words);
     run(&mut bash)
 }
+
+/// A process that is killed when this is dropped, for example when its test fails.
+pub struct Running(pub Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}

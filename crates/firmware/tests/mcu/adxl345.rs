@@ -93,13 +93,11 @@ fn a_message_is_ten_samples_byte_for_byte() {
     let mut rig = Rig::configured(CONFIG);
     plug(&rig, measuring(1000));
     rig.send("query_adxl345 oid=1 rest_ticks=10500");
-    rig.run_until(10_499);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(10_499, &[]);
     rig.run_until(10_500);
     let data: String = (0..10).map(|n| format!("{n:02x}00ffe060")).collect();
     assert_eq!(rig.responses(), [format!("sensor_bulk_data oid=1 sequence=0 data={data}")]);
-    rig.run_until(10_500 + 9_400);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(10_500 + 9_400, &[]);
     rig.run_until(40_000);
     let reports = rig.responses();
     assert_eq!(field(&reports[0], "sequence"), "1");
@@ -268,8 +266,7 @@ fn an_ended_query_says_nothing_more_and_the_next_begins_at_zero() {
     // During a reading.
     rig.run_until(22_000);
     rig.send("query_adxl345 oid=1 rest_ticks=0");
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
     assert_eq!(rig.turn(), rig.mcu.next_timer());
 
     rig.send("query_adxl345 oid=1 rest_ticks=20000");
@@ -288,9 +285,7 @@ fn an_ended_query_says_nothing_more_and_the_next_begins_at_zero() {
 #[test]
 fn a_sensor_needs_an_spi_device() {
     for command in ["config_adxl345 oid=1 spi_oid=0", "config_adxl345 oid=1 spi_oid=200"] {
-        let mut rig = Rig::new();
-        rig.send_all(&["allocate_oids count=5", "config_trsync oid=0", command]);
-        assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+        Rig::new().refuses(&["config_trsync oid=0", command], "Invalid oid type");
     }
 }
 

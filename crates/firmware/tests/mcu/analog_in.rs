@@ -20,12 +20,9 @@ fn a_report_is_the_sum_of_its_samples() {
     let mut rig = Rig::configured(&[SENSOR]);
     rig.bench.script_adc(ANALOG, &[4095, 4095, 4095, 4094, 1, 2, 3, 4, 0]);
     rig.send(&query(1, 0, 65535, 1));
-    rig.run_until(7999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(8000);
-    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 values=fb3f"]);
-    rig.run_until(108_000);
-    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@205000 values=0a00"]);
+    rig.sends_until(7999, &[]);
+    rig.sends_until(8000, &["analog_in_state oid=0 next_clock=@105000 values=fb3f"]);
+    rig.sends_until(108_000, &["analog_in_state oid=0 next_clock=@205000 values=0a00"]);
 }
 
 #[test]
@@ -45,8 +42,7 @@ fn readings_are_packed_until_the_next_does_not_fit() {
 #[test]
 fn more_bytes_than_a_report_has_are_refused() {
     let mut rig = Rig::configured(&[SENSOR]);
-    rig.send(&query(49, 0, 65535, 1));
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid analog_in bytes_per_report"));
+    rig.stops_on(&query(49, 0, 65535, 1), "Invalid analog_in bytes_per_report");
 }
 
 #[test]
@@ -54,8 +50,7 @@ fn what_was_refused_is_not_kept() {
     let mut rig = Rig::configured(&[SENSOR]);
     rig.bench.script_adc(ANALOG, &[100]);
     rig.send(&query(4, 0, 65535, 1));
-    rig.send(&query(255, 0, 65535, 1));
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid analog_in bytes_per_report"));
+    rig.stops_on(&query(255, 0, 65535, 1), "Invalid analog_in bytes_per_report");
     // The stopped MCU goes on sampling with the earlier settings, the same as a running one.
     rig.run_until(10_000_000);
     let reports = rig.responses();
@@ -73,8 +68,7 @@ fn so_many_readings_in_a_row_may_be_out_of_range() {
     assert_eq!(rig.shutdown(), None);
     rig.run_until(507_999);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(508_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("ADC out of range"));
+    rig.stops_by(508_000, "ADC out of range");
 }
 
 #[test]
@@ -93,8 +87,7 @@ fn temperatures_are_reported_after_a_shutdown_too_and_the_reason_stays() {
     let mut rig = Rig::configured(&[SENSOR]);
     rig.bench.script_adc(ANALOG, &[50]);
     rig.send(&query(1, 300, 65535, 1));
-    rig.run_until(10_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("ADC out of range"));
+    rig.stops_by(10_000, "ADC out of range");
     rig.run_until(310_000);
     let reports = rig.responses();
     assert_eq!(reports.len(), 3, "{reports:?}");
@@ -108,12 +101,9 @@ fn a_query_without_samples_ends_the_reports() {
     rig.send(&query(1, 0, 65535, 1));
     rig.run_until(6500);
     rig.send("query_analog_in oid=0 clock=@0 sample_ticks=0 sample_count=0 rest_ticks=0 bytes_per_report=0 min_value=0 max_value=0 range_check_count=0");
-    rig.run_until(500_000);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.send("emergency_stop");
-    assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(500_000, &[]);
+    rig.stops_on("emergency_stop", "Command request");
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]
@@ -127,8 +117,7 @@ fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_mcu_stops() {
     rig.run_until(6_100_000);
     assert_eq!(rig.shutdown(), None, "it lags behind nothing");
     rig.send("emergency_stop");
-    rig.run_until(6_200_000);
-    assert_eq!(rig.responses(), ["shutdown clock=@6100000 static_string_id=Command request"]);
+    rig.sends_until(6_200_000, &["shutdown clock=@6100000 static_string_id=Command request"]);
     assert_eq!(rig.turn(), rig.mcu.next_timer(), "nothing is under way any more");
 }
 
@@ -139,12 +128,9 @@ fn reads_that_fail_for_100_ms_stop_the_mcu_and_reports_come_once_it_works_again(
     rig.send(&query(1, 0, 65535, 1));
     rig.bench.state().broken.insert(ANALOG);
     // Sums without any reading are due every 100000 ticks from 5000 on.
-    rig.run_until(5_004_999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(5_005_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Error on analog read"));
-    rig.run_until(5_500_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(5_004_999, &[]);
+    rig.stops_by(5_005_000, "Error on analog read");
+    rig.sends_until(5_500_000, &[]);
     rig.bench.state().broken.clear();
     rig.run_until(5_800_000);
     assert_eq!(rig.responses().len(), 3);
@@ -156,11 +142,9 @@ fn a_read_that_fails_is_tried_again_and_then_its_sum_is_left_out() {
     rig.bench.script_adc(ANALOG, &[1]);
     rig.send(&query(1, 0, 65535, 1));
     rig.bench.state().nacks.insert(ANALOG, 2);
-    rig.run_until(50_000);
-    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 values=0400"]);
+    rig.sends_until(50_000, &["analog_in_state oid=0 next_clock=@105000 values=0400"]);
     rig.bench.state().nacks.insert(ANALOG, 3);
-    rig.run_until(250_000);
-    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 values=0400"]);
+    rig.sends_until(250_000, &["analog_in_state oid=0 next_clock=@305000 values=0400"]);
     // One more failure, long after: it is the first of a new row.
     rig.run_until(6_000_000);
     rig.bench.state().nacks.insert(ANALOG, 3);
@@ -216,6 +200,5 @@ fn an_answer_to_an_earlier_query_is_not_counted() {
     rig.send(&query(1, 0, 65535, 1));
     rig.run_until(6000);
     rig.send(&query(1, 0, 65535, 1).replace("@5000", "@7000"));
-    rig.run_until(50_000);
-    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@107000 values=2800"]);
+    rig.sends_until(50_000, &["analog_in_state oid=0 next_clock=@107000 values=2800"]);
 }

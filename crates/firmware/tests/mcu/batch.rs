@@ -135,8 +135,7 @@ fn a_stop_in_a_batch_loses_no_step() {
         start(&mut rig);
         (0..STEPPERS).for_each(|n| step(&mut rig, n, 5000, 3));
         step(&mut rig, 0, 100_000u32.wrapping_neg(), 1);
-        rig.run_until(100_000);
-        assert_eq!(rig.shutdown().as_deref(), Some("Stepper too far in past"));
+        rig.stops_by(100_000, "Stepper too far in past");
         rig.send("clear_shutdown");
         for n in 0..STEPPERS {
             assert_eq!(rig.ask(&format!("stepper_get_position oid={n}")), format!("stepper_position oid={n} pos=-3"));

@@ -27,13 +27,10 @@ fn a_level_counts_once_two_samples_in_a_row_have_it() {
     let mut rig = buttons();
     // One sample is high, at 3000. From 6000 on all samples are high.
     rig.bench.script_input(A, &[(2500, 1), (3500, 0), (5500, 1)]);
-    rig.run_until(6999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(7000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+    rig.sends_until(6999, &[]);
+    rig.sends_until(7000, &["buttons_state oid=0 ack_count=0 state=01"]);
     rig.send("buttons_ack oid=0 count=1");
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]
@@ -41,8 +38,7 @@ fn a_button_that_bounces_does_not_hold_up_another() {
     let mut rig = buttons();
     rig.bench.script_input(A, &[(1500, 1), (2500, 0), (3500, 1), (4500, 0)]);
     rig.bench.script_input(B, &[(2500, 1)]);
-    rig.run_until(10_000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=02"]);
+    rig.sends_until(10_000, &["buttons_state oid=0 ack_count=0 state=02"]);
 }
 
 #[test]
@@ -50,10 +46,8 @@ fn a_button_that_rests_high_is_not_pressed_from_the_start() {
     let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
     rig.bench.script_input(A, &[(0, 1), (5500, 0)]);
     start(&mut rig, 50, 1);
-    rig.run_until(6999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(7000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=00"]);
+    rig.sends_until(6999, &[]);
+    rig.sends_until(7000, &["buttons_state oid=0 ack_count=0 state=00"]);
 }
 
 #[test]
@@ -64,13 +58,10 @@ fn what_is_not_acknowledged_is_told_again() {
         start(&mut rig, count, 0);
         // The samples at 1000 and 2000 are high. The report is repeated `count` + 1 samples later.
         let again = 2000 + 1000 * (u64::from(count) + 1);
-        rig.run_until(again - 1);
-        assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
-        rig.run_until(again);
-        assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+        rig.sends_until(again - 1, &["buttons_state oid=0 ack_count=0 state=01"]);
+        rig.sends_until(again, &["buttons_state oid=0 ack_count=0 state=01"]);
         rig.send("buttons_ack oid=0 count=1");
-        rig.run_until(100_000);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(100_000, &[]);
     }
 }
 
@@ -85,15 +76,12 @@ fn reports_pile_up_in_order_and_leave_as_they_are_acknowledged() {
     assert_eq!(rig.responses(), reports);
     rig.send("buttons_ack oid=0 count=1");
     // The last report was at 11000. The rest comes 51 samples later.
-    rig.run_until(11_000 + 51_000 - 1);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(11_000 + 51_000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=1 state=0002"]);
+    rig.sends_until(11_000 + 51_000 - 1, &[]);
+    rig.sends_until(11_000 + 51_000, &["buttons_state oid=0 ack_count=1 state=0002"]);
     // This acknowledges more than there are. The MCU keeps klippy's count.
     rig.send("buttons_ack oid=0 count=255");
     rig.bench.script_input(B, &[(70_500, 0)]);
-    rig.run_until(80_000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=00"]);
+    rig.sends_until(80_000, &["buttons_state oid=0 ack_count=0 state=00"]);
 }
 
 #[test]
@@ -121,11 +109,9 @@ fn a_query_begins_anew_and_one_without_rest_ends() {
     // A restarted klippy sends this while the MCU stays configured.
     rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
     rig.send("buttons_query oid=0 clock=@6000 rest_ticks=1000 retransmit_count=5 invert=0");
-    rig.run_until(7000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+    rig.sends_until(7000, &["buttons_state oid=0 ack_count=0 state=01"]);
     rig.send("buttons_query oid=0 clock=@0 rest_ticks=0 retransmit_count=5 invert=0");
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
 }
 
 #[test]
@@ -156,19 +142,16 @@ fn resistors_reach_the_board_after_finalize_config() {
 fn a_line_that_is_gone_stops_the_mcu_and_a_stopped_mcu_samples_no_more() {
     let mut rig = buttons();
     rig.bench.state().broken.insert(B);
-    rig.run_until(10_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(10_000, "GPIO line read failed");
     rig.bench.state().broken.clear();
     rig.bench.script_input(A, &[(11_000, 1)]);
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
     // It works after a new configuration.
     rig.send("config_reset");
     rig.configure(&["config_buttons oid=0 button_count=2"]);
     rig.send("buttons_add oid=0 pos=0 pin=30 pull_up=0");
     rig.send("buttons_query oid=0 clock=@101000 rest_ticks=1000 retransmit_count=5 invert=0");
-    rig.run_until(103_000);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+    rig.sends_until(103_000, &["buttons_state oid=0 ack_count=0 state=01"]);
 }
 
 /// Button B is on an expander that needs 1500 ticks for a look.
@@ -187,13 +170,10 @@ fn an_expander_s_button_is_sampled_as_often_as_its_worker_looks() {
     rig.bench.script_input(A, &[(2500, 1)]);
     rig.bench.script_input(B, &[(4000, 1)]);
     // The samples at 1000, 3000, 5000 and 7000 are each complete 1500 later.
-    rig.run_until(6499);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(6500);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=03"]);
+    rig.sends_until(6499, &[]);
+    rig.sends_until(6500, &["buttons_state oid=0 ack_count=0 state=03"]);
     rig.send("buttons_ack oid=0 count=1");
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
 }
 
 #[test]
@@ -206,8 +186,7 @@ fn a_look_under_way_is_not_taken_for_one_of_a_later_query_or_line() {
         "buttons_add oid=0 pos=1 pin=30 pull_up=0",
         "buttons_query oid=0 clock=@3500 rest_ticks=1000 retransmit_count=50 invert=0",
     ]);
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
     rig.bench.script_input(A, &[(101_000, 1)]);
     rig.run_until(110_000);
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=03"], "both places are pin 30 now");
@@ -225,10 +204,8 @@ fn an_expander_that_fails_for_100_ms_stops_the_mcu() {
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"], "others go on");
     rig.send("buttons_ack oid=0 count=1");
     // The first sample that fails is at 1000. Each sample is complete 1500 later.
-    rig.run_until(1000 + UNREAD_LIMIT - 1);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(1000 + UNREAD_LIMIT + 2000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.sends_until(1000 + UNREAD_LIMIT - 1, &[]);
+    rig.stops_by(1000 + UNREAD_LIMIT + 2000, "GPIO line read failed");
 }
 
 #[test]
@@ -238,14 +215,12 @@ fn a_look_that_fails_is_no_sample_and_changes_nothing() {
     // Samples at 1000, 3000, 5000, 7000. It is high at 3000, but nothing confirms it because the look at 5000 fails.
     rig.run_until(5000);
     rig.bench.state().nacks.insert(B, 3);
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
     // It is high from then on. A look with failed tries is reported like one without.
     rig.bench.script_input(B, &[(100_600, 1)]);
     rig.run_until(102_000);
     rig.bench.state().nacks.insert(B, 2);
-    rig.run_until(104_500);
-    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=02"]);
+    rig.sends_until(104_500, &["buttons_state oid=0 ack_count=0 state=02"]);
 }
 
 #[test]
@@ -255,8 +230,7 @@ fn an_expander_that_hangs_for_100_ms_stops_the_mcu() {
     rig.bench.state().answer_ticks = 500_000_000;
     rig.run_until(5000 + UNREAD_LIMIT - 1);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(5000 + UNREAD_LIMIT);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(5000 + UNREAD_LIMIT, "GPIO line read failed");
     let notes = rig.notes();
     assert!(notes.iter().any(|note| note.contains("buttons oid 0: gpio31 has not answered for 100 ms: ")), "{notes:?}");
 }

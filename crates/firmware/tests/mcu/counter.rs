@@ -14,18 +14,16 @@ fn edges_are_counted_and_told_in_intervals() {
     let edges: Vec<(u64, u8)> = (0..100).map(|n| (12_500 + 2500 * n, (n % 2 == 0).into())).collect();
     rig.bench.script_input(TACHO, &edges);
     rig.send(QUERY);
-    rig.run_until(10_999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(60_000);
-    assert_eq!(
-        rig.responses(),
-        [
+    rig.sends_until(10_999, &[]);
+    rig.sends_until(
+        60_000,
+        &[
             // The first report comes after the second look, as in the firmware.
             "counter_state oid=0 next_clock=@12000 count=0 count_clock=@10000",
             // Eight edges at 12500, 15000, ..., 30000.
             "counter_state oid=0 next_clock=@33000 count=8 count_clock=@30000",
             "counter_state oid=0 next_clock=@54000 count=17 count_clock=@53000",
-        ]
+        ],
     );
 }
 
@@ -46,12 +44,10 @@ fn a_query_goes_on_counting_and_a_shutdown_ends_it() {
     rig.run_until(15_000);
     rig.send("query_counter oid=0 clock=@20000 poll_ticks=500 sample_ticks=10000");
     rig.responses();
-    rig.run_until(25_000);
-    assert_eq!(rig.responses(), ["counter_state oid=0 next_clock=@21000 count=1 count_clock=@13000"]);
+    rig.sends_until(25_000, &["counter_state oid=0 next_clock=@21000 count=1 count_clock=@13000"]);
     rig.send("emergency_stop");
     rig.responses();
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]
@@ -59,8 +55,7 @@ fn a_line_that_is_gone_stops_the_mcu() {
     let mut rig = Rig::configured(&[COUNTER]);
     rig.bench.state().broken.insert(TACHO);
     rig.send(QUERY);
-    rig.run_until(20_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(20_000, "GPIO line read failed");
 }
 
 #[test]
@@ -72,22 +67,20 @@ fn an_expander_s_pin_is_looked_at_as_often_as_its_worker_can() {
     rig.bench.script_input(TACHO, &[(14_000, 1)]);
     rig.send(QUERY);
     // Looks begin at 10000, 12000, 14000, ...
-    rig.run_until(40_000);
-    assert_eq!(
-        rig.responses(),
-        [
+    rig.sends_until(
+        40_000,
+        &[
             // The times are the ends of the looks.
             "counter_state oid=0 next_clock=@12500 count=0 count_clock=@10000",
             "counter_state oid=0 next_clock=@34500 count=1 count_clock=@15500",
-        ]
+        ],
     );
     // While looks fail, the last level counts for 100 ms.
     rig.bench.state().broken.insert(TACHO);
     rig.run_until(40_000 + 5_000_000 - 1);
     let told = told(&rig);
     assert!(told.len() > 200 && told.iter().all(|state| *state == (1, 15_500)), "{told:?}");
-    rig.run_until(50_000 + 5_000_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(50_000 + 5_000_000, "GPIO line read failed");
 }
 
 #[test]
@@ -128,14 +121,13 @@ fn the_kernel_s_count_is_told_with_the_instant_of_its_last_edge() {
     let mut rig = counted(0);
     rig.bench.script_input(TACHO, &[(20_100, 1), (20_900, 0), (22_500, 1)]);
     rig.send(QUERY);
-    rig.run_until(49_999);
-    assert_eq!(
-        rig.responses(),
-        [
+    rig.sends_until(
+        49_999,
+        &[
             "counter_state oid=0 next_clock=@11000 count=0 count_clock=@10000",
             // Polling would have missed the first two, because they are too close.
             "counter_state oid=0 next_clock=@31000 count=3 count_clock=@22500",
-        ]
+        ],
     );
 }
 
@@ -258,10 +250,8 @@ fn a_counted_line_that_is_gone_stops_the_mcu() {
     let mut rig = counted(0);
     rig.bench.state().broken.insert(TACHO);
     rig.send(QUERY);
-    rig.run_until(20_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.stops_by(20_000, "GPIO line read failed");
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]
@@ -271,8 +261,7 @@ fn nothing_is_told_of_a_query_that_a_shutdown_ended() {
     rig.run_until(20_000);
     rig.send("emergency_stop");
     rig.responses();
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]

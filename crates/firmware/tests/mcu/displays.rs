@@ -165,8 +165,7 @@ fn a_display_is_there_for_the_next_configuration() {
     rig.configure(&[ST7920]);
     rig.send("st7920_send_cmds oid=0 cmds=01");
     assert_eq!(hear_st7920(&rig).len(), 3);
-    rig.send("hd44780_send_cmds oid=0 cmds=01");
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    rig.stops_on("hd44780_send_cmds oid=0 cmds=01", "Invalid oid type");
 }
 
 #[test]
@@ -176,8 +175,7 @@ fn a_line_that_is_gone_stops_the_mcu_and_is_tried_again() {
     {
         let mut rig = Rig::configured(&[config]);
         rig.bench.state().broken.insert(pin);
-        rig.send(command);
-        assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
+        rig.stops_on(command, "GPIO line write failed");
         rig.run_until(10_000_000);
         assert!(rig.mcu.has_pending_values());
         rig.bench.state().broken.clear();
@@ -202,6 +200,5 @@ fn a_display_behind_an_expander_works() {
 fn a_display_that_takes_forever_stops_the_mcu() {
     let mut rig = Rig::configured(&[&HD44780.replace("=2000", "=4000000000")]);
     rig.begin("hd44780_send_data oid=0 data=4142");
-    rig.run_until(300_000_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    rig.stops_by(300_000_000, "Bus does not answer");
 }

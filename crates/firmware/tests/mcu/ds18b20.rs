@@ -36,8 +36,7 @@ fn reading(next_ms: u64, value: i32, fault: u8) -> String {
 fn a_temperature_is_told_when_it_is_there_with_the_time_it_was_asked_for() {
     let mut rig = rig(750, &[Some(85_500), Some(-10_250)]);
     rig.send(&query(-55_000, 125_000));
-    rig.run_until(850 * MS - 1);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(850 * MS - 1, &[]);
     rig.run_until(850 * MS);
     assert_eq!(rig.responses(), [reading(3100, 85_500, 0)]);
     rig.run_until(4000 * MS);
@@ -56,8 +55,7 @@ fn failures_are_told_with_the_last_temperature_until_there_are_too_many() {
         .map(|((value, fault), n)| reading(100 + 3000 * n, value * 1000, *fault))
         .collect();
     assert_eq!(rig.responses(), expected);
-    rig.run_until(25_000 * MS);
-    assert_eq!(rig.shutdown().as_deref(), Some("Error reading DS18B20 sensor"));
+    rig.stops_by(25_000 * MS, "Error reading DS18B20 sensor");
     let note = rig.notes().pop().unwrap();
     assert!(note.contains("wrong CRC") && note.contains("5 readings in a row"), "{note}");
 }
@@ -87,10 +85,8 @@ fn a_sensor_that_does_not_answer_stops_the_mcu() {
     // Queries at 100, 3100 and 6100 ms.
     rig.run_until(6099 * MS);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(6100 * MS);
-    assert_eq!(rig.shutdown().as_deref(), Some("DS18B20 sensor didn't respond in time"));
-    rig.run_until(60_000 * MS);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.stops_by(6100 * MS, "DS18B20 sensor didn't respond in time");
+    rig.sends_until(60_000 * MS, &[]);
 }
 
 #[test]
@@ -115,8 +111,7 @@ fn a_reading_of_an_earlier_query_is_not_told_and_steps_are_in_time() {
     assert_eq!(rig.responses(), [reading(3900, 20_000, 0)]);
     assert!(rig.edges(1).iter().zip(1..).all(|((at, _), n)| *at == 45_000_000 + 100_000 * n));
     rig.send("query_ds18b20 oid=0 clock=@0 rest_ticks=0 min_value=0 max_value=0");
-    rig.run_until(60_000 * MS);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(60_000 * MS, &[]);
 }
 
 #[test]
@@ -128,7 +123,6 @@ fn what_can_not_be_configured() {
     ] {
         let mut rig = Rig::new();
         rig.bench.script_ds18b20(SERIAL, &[Some(0)]);
-        rig.send_all(&["allocate_oids count=1", &config(serial)]);
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.refuses(&[&config(serial)], text);
     }
 }

@@ -42,10 +42,8 @@ fn every_stepper_stops_on_the_tick_of_the_last_sample() {
     // Samples at 1000, 1700, ..., 5900. The switch closes before 5900. The samples at 5900, 5950, 6000 and 6050 are
     // closed.
     rig.bench.script_input(SWITCH, &[(5500, 1)]);
-    rig.run_until(6049);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@3000"]);
-    rig.run_until(6050);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@6050"]);
+    rig.sends_until(6049, &["trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@3000"]);
+    rig.sends_until(6050, &["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@6050"]);
     let query = rig.ask("endstop_query_state oid=2");
     assert_eq!(query, "endstop_state oid=2 homing=1 next_clock=@6600 pin_value=1");
     rig.run_until(100_000);
@@ -92,20 +90,18 @@ fn an_mcu_that_stood_still_takes_steps_and_samples_in_their_order() {
 fn reports_go_on_after_a_trigger_until_the_host_ends_them() {
     let mut rig = homing();
     rig.bench.script_input(SWITCH, &[(5500, 1)]);
-    rig.run_until(14_000);
-    assert_eq!(
-        rig.responses(),
-        [
+    rig.sends_until(
+        14_000,
+        &[
             "trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@3000",
             "trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@6050",
             "trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@8000",
             "trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@13000",
-        ]
+        ],
     );
     // The first reason stays, also after another trigger.
     assert!(rig.ask("trsync_trigger oid=3 reason=2").starts_with("trsync_state oid=3 can_trigger=0 trigger_reason=1 "));
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
 }
 
 #[test]
@@ -130,8 +126,7 @@ fn one_sample_may_do() {
         "trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=4",
         "endstop_home oid=2 clock=@1000 sample_ticks=50 sample_count=1 rest_ticks=700 pin_value=0 trsync_oid=3 trigger_reason=9",
     ]);
-    rig.run_until(50_000);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=9 clock=@3100"]);
+    rig.sends_until(50_000, &["trsync_state oid=3 can_trigger=0 trigger_reason=9 clock=@3100"]);
 }
 
 #[test]
@@ -141,8 +136,7 @@ fn homing_ends_when_the_host_says_so() {
     rig.run_until(5000);
     rig.send("endstop_home oid=2 clock=@0 sample_ticks=0 sample_count=0 rest_ticks=0 pin_value=0 trsync_oid=0 trigger_reason=0");
     rig.responses();
-    rig.run_until(10_000);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@8000"]);
+    rig.sends_until(10_000, &["trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@8000"]);
     assert!(rig.ask("endstop_query_state oid=2").starts_with("endstop_state oid=2 homing=0 "));
 }
 
@@ -151,8 +145,7 @@ fn a_trsync_expires_for_its_own_reason() {
     let mut rig = homing();
     rig.run_until(19_999);
     rig.responses();
-    rig.run_until(20_000);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@20000"]);
+    rig.sends_until(20_000, &["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@20000"]);
     rig.run_until(22_000);
     // The step of tick 20000 came before the trigger or not at all. Both steppers agree.
     let (a, b) = steps(&mut rig);
@@ -168,12 +161,10 @@ fn a_timeout_that_is_set_anew_in_time_does_not_expire() {
     }
     rig.run_until(64_999);
     assert!(rig.responses().iter().all(|report| report.contains("can_trigger=1")));
-    rig.run_until(65_000);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@65000"]);
+    rig.sends_until(65_000, &["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@65000"]);
     // After the trigger, nothing expires.
     rig.send("trsync_set_timeout oid=3 clock=@66000");
-    rig.run_until(67_999);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(67_999, &[]);
 }
 
 #[test]
@@ -205,8 +196,10 @@ fn a_stepper_waits_for_one_trigger_at_a_time() {
     for trsync in [3, 4] {
         let mut rig = homing();
         rig.send("trsync_start oid=4 report_clock=@0 report_ticks=0 expire_reason=4");
-        rig.send(&format!("stepper_stop_on_trigger oid=0 trsync_oid={trsync}"));
-        assert_eq!(rig.shutdown().as_deref(), Some("Can't add signal that is already active"));
+        rig.stops_on(
+            &format!("stepper_stop_on_trigger oid=0 trsync_oid={trsync}"),
+            "Can't add signal that is already active",
+        );
     }
     // A new start of a trsync removes the steppers that waited for it.
     let mut rig = homing();
@@ -229,8 +222,7 @@ fn a_search_without_rest_stops_the_mcu_once_it_is_behind() {
     rig.stall_until(5_000_000);
     rig.run_until(5_000_500);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(5_001_500);
-    assert_eq!(rig.shutdown().as_deref(), Some("Rescheduled timer in the past"));
+    rig.stops_by(5_001_500, "Rescheduled timer in the past");
 }
 
 #[test]
@@ -244,16 +236,14 @@ fn the_bias_reaches_the_board() {
 #[test]
 fn homing_needs_a_trsync() {
     let mut rig = Rig::configured(OBJECTS);
-    rig.send("endstop_home oid=2 clock=@1000 sample_ticks=50 sample_count=4 rest_ticks=0 pin_value=1 trsync_oid=0 trigger_reason=1");
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    rig.stops_on("endstop_home oid=2 clock=@1000 sample_ticks=50 sample_count=4 rest_ticks=0 pin_value=1 trsync_oid=0 trigger_reason=1", "Invalid oid type");
 }
 
 #[test]
 fn a_switch_that_is_gone_stops_the_mcu() {
     let mut rig = homing();
     rig.bench.state().broken.insert(SWITCH);
-    rig.run_until(2000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(2000, "GPIO line read failed");
 }
 
 #[test]

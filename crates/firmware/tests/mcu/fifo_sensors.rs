@@ -252,8 +252,7 @@ fn nothing_is_read_until_there_is_a_block_and_all_blocks_at_once() {
         let mut rig = Rig::configured(&setup.config());
         let chip = setup.plug(&rig, 1000);
         rig.send(&setup.query(7_500));
-        rig.run_until(7_500);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(7_500, &[]);
         rig.run_until(15_000);
         assert_eq!(rig.responses().len(), 1);
         rig.run_until(22_500);
@@ -320,8 +319,7 @@ fn an_i2c_failure_stops_the_mcu_with_the_firmware_s_text() {
                 assert_eq!(rig.shutdown().as_deref(), Some(text), "{setup:?}");
                 let notes = rig.notes();
                 assert!(notes.iter().any(|note| note.contains(" oid 1: ")), "{notes:?}");
-                rig.run_until(10_000);
-                assert_eq!(rig.responses(), [""; 0]);
+                rig.sends_until(10_000, &[]);
 
                 rig.send("config_reset");
                 rig.configure(&setup.config());
@@ -390,13 +388,10 @@ fn what_a_sensor_can_not_be_is_refused() {
         ("config_bmi160 oid=1 bus_oid=0 bus_oid_type=1", "Invalid oid type"),
         ("config_icm20948 oid=1 i2c_oid=0", "Invalid oid type"),
     ] {
-        let mut rig = Rig::new();
-        rig.send_all(&["allocate_oids count=5", "config_spi_without_cs oid=0", command]);
-        assert_eq!(rig.shutdown().as_deref(), Some(text), "{command}");
+        Rig::new().refuses(&["config_spi_without_cs oid=0", command], text);
     }
     let mut rig = Rig::configured(&SETUPS[0].config());
-    rig.send("query_bmi160 oid=1 rest_ticks=1000");
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    rig.stops_on("query_bmi160 oid=1 rest_ticks=1000", "Invalid oid type");
 }
 
 #[test]

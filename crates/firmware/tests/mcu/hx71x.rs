@@ -324,15 +324,15 @@ fn what_is_wrong_with_it_is_refused() {
     for gain_channel in [0, 5, 255] {
         let mut rig = Rig::new();
         rig.send("allocate_oids count=1");
-        rig.send(&format!("config_hx71x oid=0 gain_channel={gain_channel} dout_pin=10 sclk_pin=11"));
-        assert_eq!(rig.shutdown().as_deref(), Some("HX71x gain/channel out of range 1-4"));
+        rig.stops_on(
+            &format!("config_hx71x oid=0 gain_channel={gain_channel} dout_pin=10 sclk_pin=11"),
+            "HX71x gain/channel out of range 1-4",
+        );
     }
     for (pin, text) in [(DOUT, "Unable to open in GPIO chip line"), (SCLK, "Unable to open out GPIO chip line")] {
         let mut rig = Rig::new();
         rig.bench.state().sleeping.insert(pin);
-        rig.send("allocate_oids count=1");
-        rig.send("config_hx71x oid=0 gain_channel=1 dout_pin=10 sclk_pin=11");
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.refuses(&["config_hx71x oid=0 gain_channel=1 dout_pin=10 sclk_pin=11"], text);
         assert!(rig.notes().pop().unwrap().contains("choose a pin of the processor itself"));
     }
 }
@@ -345,8 +345,7 @@ fn lines_that_fail_stop_the_mcu_and_it_can_be_configured_anew() {
         rig.run_until(6 * PERIOD);
         rig.responses();
         rig.bench.state().broken.insert(pin);
-        rig.run_until(8 * PERIOD);
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.stops_by(8 * PERIOD, text);
         assert!(rig.notes().pop().unwrap().contains("HX71x oid 0 (gpio10)"));
         rig.bench.state().broken.clear();
         rig.send("config_reset");
@@ -368,8 +367,7 @@ fn a_shutdown_amid_a_reading_ends_the_samples() {
     rig.send(QUERY);
     rig.run_until(2_580_000);
     rig.send("emergency_stop");
-    rig.run_until(60 * PERIOD);
-    assert_eq!(rig.responses(), ["shutdown clock=@2580000 static_string_id=Command request"]);
+    rig.sends_until(60 * PERIOD, &["shutdown clock=@2580000 static_string_id=Command request"]);
 }
 
 #[test]
@@ -469,12 +467,10 @@ fn a_shutdown_or_a_failure_of_the_bus_ends_the_samples() {
     rig.send(QUERY);
     rig.run_until(6 * PERIOD);
     rig.bench.state().broken.insert(SPI_CHIPS);
-    rig.run_until(8 * PERIOD);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+    rig.stops_by(8 * PERIOD, "Unable to issue spi ioctl");
     rig.bench.state().broken.clear();
     rig.responses();
-    rig.run_until(30 * PERIOD);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(30 * PERIOD, &[]);
 }
 
 #[test]
@@ -485,8 +481,7 @@ fn the_two_pins_on_spi_belong_together() {
         (format!("dout_pin=10 sclk_pin={MOSI}"), "no pin 700"),
     ] {
         let mut rig = Rig::new();
-        rig.send_all(&["allocate_oids count=1", &format!("config_hx71x oid=0 gain_channel=1 {pins}")]);
-        assert_eq!(rig.shutdown().as_deref(), Some("Not an output pin"));
+        rig.refuses(&[&format!("config_hx71x oid=0 gain_channel=1 {pins}")], "Not an output pin");
         let notes = rig.notes();
         assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
     }

@@ -175,12 +175,10 @@ fn an_address_has_seven_bits_and_a_device_without_a_bus_acknowledges_nothing() {
 
 #[test]
 fn a_bus_is_set_in_the_configuration_and_has_to_be_there() {
-    let mut rig = Rig::new();
-    rig.send_all(&["allocate_oids count=1", "config_i2c oid=0", "i2c_set_bus oid=0 i2c_bus=2 rate=1 address=1"]);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open i2c device"));
+    Rig::new()
+        .refuses(&["config_i2c oid=0", "i2c_set_bus oid=0 i2c_bus=2 rate=1 address=1"], "Unable to open i2c device");
     let mut rig = Rig::configured(&["config_i2c oid=0"]);
-    rig.send("i2c_set_bus oid=0 i2c_bus=0 rate=1 address=1");
-    assert_eq!(rig.shutdown().as_deref(), Some("Can't assign oid"));
+    rig.stops_on("i2c_set_bus oid=0 i2c_bus=0 rate=1 address=1", "Can't assign oid");
 }
 
 #[test]
@@ -189,10 +187,9 @@ fn a_stopped_mcu_ends_what_is_under_way_and_starts_anew() {
     plug(&rig, &[]);
     rig.begin("i2c_transfer oid=0 write=10 read_len=1");
     rig.send("emergency_stop");
-    rig.run_until(100_000);
-    assert_eq!(
-        rig.responses(),
-        ["shutdown clock=@0 static_string_id=Command request", "i2c_response oid=0 i2c_bus_status=0 response=10"]
+    rig.sends_until(
+        100_000,
+        &["shutdown clock=@0 static_string_id=Command request", "i2c_response oid=0 i2c_bus_status=0 response=10"],
     );
     assert_eq!(rig.ask("i2c_transfer oid=0 write=10 read_len=1"), "is_shutdown static_string_id=Command request");
     rig.send("config_reset");

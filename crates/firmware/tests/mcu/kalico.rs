@@ -289,12 +289,10 @@ fn an_ads131m0x_with_channels_that_it_does_not_have_is_refused() {
         (2, 0, "ads131m0x invalid channel_mask"),
         (2, 4, "ads131m0x invalid channel_mask"),
     ] {
-        let mut rig = Rig::of(Kalico);
-        rig.send_all(&["allocate_oids count=2", "config_spi_without_cs oid=0"]);
-        rig.send(&format!(
+        let chip = format!(
             "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count={count} channel_mask={mask}"
-        ));
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        );
+        Rig::of(Kalico).refuses(&["config_spi_without_cs oid=0", &chip], text);
     }
 }
 

@@ -46,10 +46,8 @@ fn a_send_is_over_before_the_next_command() {
     let mut rig = Rig::with_workers(5000, &[CHAIN]);
     rig.begin("neopixel_send oid=0");
     assert!(rig.mcu.is_held());
-    rig.run_until(4999);
-    assert_eq!(rig.responses(), [""; 0]);
-    rig.run_until(5000);
-    assert_eq!(rig.responses(), ["neopixel_result oid=0 success=1"]);
+    rig.sends_until(4999, &[]);
+    rig.sends_until(5000, &["neopixel_result oid=0 success=1"]);
     assert!(!rig.mcu.is_held());
     rig.begin("neopixel_send oid=0");
     rig.mcu.shut_down(pinion_firmware::shutdown::Shutdown::because(
@@ -146,9 +144,7 @@ fn a_fast_line_behind_a_bus_that_holds_writes_back_is_refused_with_other_ways() 
     let mut rig = Rig::new();
     rig.bench.state().fast.insert(FAST);
     rig.bench.state().link = Some(SleepyLink::new(90, 1000));
-    rig.send("allocate_oids count=1");
-    rig.send(CHAIN_ON_A_LINE);
-    assert_eq!(rig.shutdown().as_deref(), Some("Not an output pin"));
+    rig.refuses(&[CHAIN_ON_A_LINE], "Not an output pin");
     let notes = rig.notes().join(" ");
     for words in ["gpio18 cannot drive LEDs: its chip is behind PCIe", "spidev0.0", "ws2812-pio"] {
         assert!(notes.contains(words), "{notes}");
@@ -165,9 +161,7 @@ fn a_line_that_is_not_fast_or_a_chain_that_is_too_long_is_refused() {
         if fast {
             rig.bench.state().fast.insert(FAST);
         }
-        rig.send("allocate_oids count=1");
-        rig.send(&CHAIN_ON_A_LINE.replace("data_size=3", &format!("data_size={size}")));
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.refuses(&[&CHAIN_ON_A_LINE.replace("data_size=3", &format!("data_size={size}"))], text);
         let notes = rig.notes().join(" ");
         assert!(notes.contains(log), "{notes}");
     }

@@ -29,11 +29,9 @@ fn each_sum_of_readings_is_a_report() {
         );
         rig.run_until(8000);
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 value=16379"], "{dialect}");
-        rig.run_until(108_000);
-        assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@205000 value=10"]);
+        rig.sends_until(108_000, &["analog_in_state oid=0 next_clock=@205000 value=10"]);
         // 8000 is out of range. The second value out of range in a row stops the MCU.
-        rig.run_until(307_999);
-        assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 value=8000"]);
+        rig.sends_until(307_999, &["analog_in_state oid=0 next_clock=@305000 value=8000"]);
         rig.run_until(308_000);
         assert_eq!(rig.shutdown().as_deref(), Some("ADC out of range"), "{dialect}");
     }
@@ -88,8 +86,7 @@ fn bits_of_registers_are_cleared_and_set() {
         assert_eq!(rig.ask("i2c_modify_bits oid=0 reg=35 clear_set_bits=f0028001"), "");
         let expected = [(vec![0x35], 2), (vec![0x35, 0x85, 0x35], 0)];
         assert_eq!(*heard.lock().unwrap(), expected);
-        rig.send("i2c_modify_bits oid=0 reg=35 clear_set_bits=f002ff");
-        assert_eq!(rig.shutdown().as_deref(), Some("i2c_modify_bits: Odd number of bits!"));
+        rig.stops_on("i2c_modify_bits oid=0 reg=35 clear_set_bits=f002ff", "i2c_modify_bits: Odd number of bits!");
         assert_eq!(heard.lock().unwrap().len(), 2);
     }
 }
@@ -127,12 +124,10 @@ fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
     // The transfer that writes back the changed bytes fails.
     let mut rig = configured(V0_12, device(V0_12));
     plug_i2c(&rig, 1, Err(Nack));
-    rig.send(MODIFY);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable write i2c device"));
+    rig.stops_on(MODIFY, "Unable write i2c device");
     // Without a bus.
     let mut rig = configured(V0_12, &["config_i2c oid=0"]);
-    rig.send("i2c_read oid=0 reg=10 read_len=1");
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to read i2c device"));
+    rig.stops_on("i2c_read oid=0 reg=10 read_len=1", "Unable to read i2c device");
 }
 
 #[test]
@@ -221,11 +216,21 @@ const ADXL345: &[&str] = &[
     "spi_set_bus oid=0 spi_bus=0 mode=3 rate=5000000",
 ];
 
-fn plug_adxl345(rig: &Rig) -> Arc<Mutex<Adxl345>> {
+/// The chip, behind a bus that needs this time for a transfer.
+fn adxl345(dialect: DialectName, answer_ticks: u32) -> (Rig, Arc<Mutex<Adxl345>>) {
+    let rig = configured(dialect, ADXL345);
     let chip = Arc::new(Mutex::new(Adxl345::default()));
     let plugged = chip.clone();
     rig.bench.plug_spi(0, move |at, bytes| plugged.lock().unwrap().exchange(at, bytes));
-    chip
+    rig.bench.state().answer_ticks = answer_ticks;
+    (rig, chip)
+}
+
+/// The chip on a slow bus, measured since 5000.
+fn measuring() -> (Rig, Arc<Mutex<Adxl345>>) {
+    let (mut rig, chip) = adxl345(V0_12, 300);
+    rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+    (rig, chip)
 }
 
 fn adxl345_data(sequence: u16, numbers: std::ops::Range<u8>) -> String {
@@ -236,8 +241,7 @@ fn adxl345_data(sequence: u16, numbers: std::ops::Range<u8>) -> String {
 #[test]
 fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
     for dialect in [V0_11, V0_12] {
-        let mut rig = configured(dialect, ADXL345);
-        let chip = plug_adxl345(&rig);
+        let (mut rig, chip) = adxl345(dialect, 0);
         rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
         rig.run_until(4999);
         assert_eq!(chip.lock().unwrap().written, []);
@@ -263,9 +267,7 @@ fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
 
 #[test]
 fn an_adxl345_that_is_read_as_it_is_to_end_loses_no_sample() {
-    let mut rig = configured(V0_12, ADXL345);
-    let chip = plug_adxl345(&rig);
-    rig.bench.state().answer_ticks = 700;
+    let (mut rig, chip) = adxl345(V0_12, 700);
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
     // It is switched on from 5000 to 5700. The reading of 9700 is under way.
     rig.run_until(9800);
@@ -280,8 +282,7 @@ fn an_adxl345_that_is_read_as_it_is_to_end_loses_no_sample() {
 
 #[test]
 fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
-    let mut rig = configured(V0_12, ADXL345);
-    let chip = plug_adxl345(&rig);
+    let (mut rig, chip) = adxl345(V0_12, 0);
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
     rig.run_until(6000);
     chip.lock().unwrap().rubbish = usize::MAX;
@@ -290,15 +291,13 @@ fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
     assert!(status.contains(" fifo=127 "), "{status}");
     let status = rig.ask("query_adxl345 oid=1 clock=0 rest_ticks=0");
     assert!(status.starts_with("adxl345_status ") && status.contains(" fifo=127 "), "{status}");
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
 }
 
 #[test]
 fn an_adxl345_that_makes_no_sense_for_once_at_its_end_tells_all_its_samples() {
     for samples in [3, 0] {
-        let mut rig = configured(V0_12, ADXL345);
-        let chip = plug_adxl345(&rig);
+        let (mut rig, chip) = adxl345(V0_12, 0);
         rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=40000");
         let end = 5000 + u64::from(samples) * 1000;
         rig.run_until(end);
@@ -339,8 +338,11 @@ fn a_lis2dw_on_spi_sends_messages_of_eight_samples() {
     assert_eq!(rig.ask("query_lis2dw_status oid=1"), status);
     assert_eq!(rig.ask("query_lis2dw oid=1 clock=0 rest_ticks=0"), status);
     assert_eq!(*heard.lock().unwrap(), [[0x2e, 0xc0], [0x2e, 0x00]]);
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(100_000, &[]);
+}
+
+fn mpu9250(dialect: DialectName) -> Vec<&'static str> {
+    [device(dialect), &["config_mpu9250 oid=1 i2c_oid=0"]].concat()
 }
 
 #[test]
@@ -358,8 +360,7 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
             }
             Ok(())
         });
-        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
-        rig.configure(&config);
+        rig.configure(&mpu9250(dialect));
         rig.send("query_mpu9250 oid=1 clock=@5000 rest_ticks=4000");
         rig.run_until(9000);
         let on = [vec![0x23, 0], vec![0x6a, 0x04], vec![0x6a, 0x40], vec![0x23, 0x08]];
@@ -396,8 +397,7 @@ fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
             }
             Ok(())
         });
-        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
-        rig.configure(&config);
+        rig.configure(&mpu9250(dialect));
         rig.send(&format!("query_mpu9250 oid=1 clock=@5000 rest_ticks={}", 4 * PERIOD));
         let number = |status: &str, name: &str| {
             let value = status.split_once(&format!(" {name}=")).unwrap().1.split(' ').next().unwrap();
@@ -422,8 +422,7 @@ fn a_sensor_whose_bus_fails_stops_the_mcu_in_the_words_of_its_time() {
         (V0_12, "query_mpu9250 oid=1 clock=@5000 rest_ticks=4000", "Unable to read i2c device"),
         (V0_13, "query_mpu9250 oid=1 rest_ticks=4000", "I2C NACK"),
     ] {
-        let config: Vec<&str> = device(dialect).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
-        let mut rig = configured(dialect, &config);
+        let mut rig = configured(dialect, &mpu9250(dialect));
         plug_i2c(&rig, 0, Err(BusStatus::Nack));
         rig.send(query);
         rig.run_until(20_000);
@@ -435,10 +434,7 @@ fn a_sensor_whose_bus_fails_stops_the_mcu_in_the_words_of_its_time() {
 #[test]
 fn a_measurement_may_be_ended_and_begun_at_any_instant() {
     for stop_at in (4000..14_000).step_by(50) {
-        let mut rig = configured(V0_12, ADXL345);
-        plug_adxl345(&rig);
-        rig.bench.state().answer_ticks = 300;
-        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+        let (mut rig, _) = measuring();
         rig.run_until(stop_at);
         rig.responses();
         rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
@@ -460,10 +456,7 @@ fn a_measurement_may_be_ended_and_begun_at_any_instant() {
 #[test]
 fn a_measurement_that_is_asked_for_anew_begins_at_its_own_clock() {
     for again_at in (4900..6000).step_by(50) {
-        let mut rig = configured(V0_12, ADXL345);
-        let chip = plug_adxl345(&rig);
-        rig.bench.state().answer_ticks = 300;
-        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+        let (mut rig, chip) = measuring();
         rig.run_until(again_at);
         rig.begin("query_adxl345 oid=1 clock=@20000 rest_ticks=2000");
         rig.run_until(19_000);
@@ -479,10 +472,7 @@ fn a_measurement_that_is_asked_for_anew_begins_at_its_own_clock() {
 /// The sensor is then on, however soon after its end.
 #[test]
 fn a_measurement_may_begin_amid_the_end_of_another() {
-    let mut rig = configured(V0_12, ADXL345);
-    let chip = plug_adxl345(&rig);
-    rig.bench.state().answer_ticks = 300;
-    rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+    let (mut rig, chip) = measuring();
     rig.run_until(20_000);
     rig.begin("query_adxl345 oid=1 clock=0 rest_ticks=0");
     rig.begin("query_adxl345 oid=1 clock=@20100 rest_ticks=2000");
@@ -495,10 +485,7 @@ fn a_measurement_may_begin_amid_the_end_of_another() {
 #[test]
 fn an_mcu_that_stops_amid_a_measurement_measures_no_more() {
     for stop_at in (4900..9000).step_by(100) {
-        let mut rig = configured(V0_12, ADXL345);
-        plug_adxl345(&rig);
-        rig.bench.state().answer_ticks = 300;
-        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+        let (mut rig, _) = measuring();
         rig.run_until(stop_at);
         rig.send("emergency_stop");
         rig.run_until(stop_at + 1000);
@@ -536,9 +523,9 @@ fn an_angle_sensor_sends_sixteen_entries_a_message_and_its_end() {
 
 // ---- the eddy current probe
 
-/// An LDC1612 that always has a sample, with the value that the mutex holds, or fails.
+/// An LDC1612 that always has a sample, with the value that the mutex holds, or fails. It homes from 50000 on.
 fn ldc1612(dialect: DialectName) -> (Rig, Arc<Mutex<Result<u32, BusStatus>>>) {
-    let rig = configured(
+    let mut rig = configured(
         dialect,
         &[
             "config_i2c oid=0",
@@ -560,20 +547,18 @@ fn ldc1612(dialect: DialectName) -> (Rig, Arc<Mutex<Result<u32, BusStatus>>>) {
         read.copy_from_slice(&(word as u16).to_be_bytes());
         Ok(())
     });
+    rig.send_all(&[
+        "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
+        "ldc1612_setup_home oid=1 clock=@50000 threshold=2000 trsync_oid=2 trigger_reason=1 error_reason=3",
+        "query_ldc1612 oid=1 rest_ticks=10000",
+    ]);
     (rig, value)
 }
-
-const SETUP: &str = "ldc1612_setup_home oid=1 clock=@50000 threshold=2000 trsync_oid=2 trigger_reason=1 error_reason=3";
 
 #[test]
 fn an_eddy_current_probe_triggers_above_its_threshold() {
     for dialect in [V0_13, Kalico] {
         let (mut rig, value) = ldc1612(dialect);
-        rig.send_all(&[
-            "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
-            SETUP,
-            "query_ldc1612 oid=1 rest_ticks=10000",
-        ]);
         // A value above the threshold does not count before homing begins.
         *value.lock().unwrap() = Ok(2001);
         rig.run_until(45_000);
@@ -593,11 +578,6 @@ fn an_eddy_current_probe_triggers_above_its_threshold() {
 fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_silent_the_mcu() {
     for dialect in [V0_13, Kalico] {
         let (mut rig, value) = ldc1612(dialect);
-        rig.send_all(&[
-            "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
-            SETUP,
-            "query_ldc1612 oid=1 rest_ticks=10000",
-        ]);
         // An error counts even before homing begins.
         *value.lock().unwrap() = Ok(0x1000_0000);
         rig.run_until(15_000);
@@ -618,12 +598,7 @@ fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_
 #[test]
 fn a_probe_that_is_no_longer_to_home_pulls_nothing() {
     let (mut rig, value) = ldc1612(V0_13);
-    rig.send_all(&[
-        "trsync_start oid=2 report_clock=@0 report_ticks=0 expire_reason=2",
-        SETUP,
-        "query_ldc1612 oid=1 rest_ticks=10000",
-        "ldc1612_setup_home oid=1 clock=0 threshold=0 trsync_oid=0 trigger_reason=0 error_reason=0",
-    ]);
+    rig.send("ldc1612_setup_home oid=1 clock=0 threshold=0 trsync_oid=0 trigger_reason=0 error_reason=0");
     *value.lock().unwrap() = Ok(0x1000_0000);
     rig.run_until(95_000);
     assert!(rig.responses().iter().all(|response| !response.starts_with("trsync_state")));

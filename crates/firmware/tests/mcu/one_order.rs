@@ -84,8 +84,7 @@ fn a_message_that_fails_is_the_last_one() {
     (0..4).for_each(|n| rig.begin(&format!("spi_send oid=0 data={n:02x}")));
     rig.run_until(1999);
     rig.bench.state().broken.insert(SPI_CHIPS);
-    rig.run_until(2000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+    rig.stops_by(2000, "Unable to issue spi ioctl");
     rig.bench.state().broken.remove(&SPI_CHIPS);
     rig.run_until(50_000);
     assert_eq!(sent(&rig), [[0], [0xee]], "two were under way, and only the message of the stop comes");
@@ -176,8 +175,7 @@ fn a_bus_that_hangs_stops_the_mcu_when_the_host_has_given_up() {
     rig.begin("spi_transfer oid=0 data=01");
     rig.run_until(249_999_999);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(250_000_001);
-    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    rig.stops_by(250_000_001, "Bus does not answer");
     let notes = rig.notes();
     assert!(notes.iter().any(|note| note.contains("SPI device oid 0 has not answered for 5 s")), "{notes:?}");
 }
@@ -187,14 +185,12 @@ fn a_bus_that_hangs_stops_the_mcu_when_the_host_has_given_up() {
 fn a_bus_that_still_hangs_stops_the_mcu_again() {
     let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);
     rig.begin("spi_transfer oid=0 data=01");
-    rig.run_until(260_000_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    rig.stops_by(260_000_000, "Bus does not answer");
     rig.begin("clear_shutdown");
     assert!(rig.mcu.is_held());
     rig.run_until(260_000_000 + 249_999_999);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(260_000_000 + 250_000_001);
-    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    rig.stops_by(260_000_000 + 250_000_001, "Bus does not answer");
     assert!(!rig.mcu.is_held());
 }
 

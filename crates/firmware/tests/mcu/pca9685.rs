@@ -95,8 +95,7 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
         let (mut rig, chip) = rig(0, &[OUTPUT, FREE]);
         bytes(&chip);
         rig.send_all(commands);
-        rig.run_until(200_000);
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.stops_by(200_000, text);
         // Both outputs have their shutdown values: off, and on.
         let told = bytes(&chip);
         let last = |register: u8| told.iter().rfind(|bytes| bytes[0] == register);
@@ -172,8 +171,7 @@ fn a_chip_that_goes_silent_stops_the_mcu_and_is_tried_until_it_answers() {
     rig.bench.plug_i2c(1, ADDRESS, |_, _, _| Err(BusStatus::Nack));
     let now = rig.now();
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
-    rig.run_until(now + 20_000_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to update PCA9685 value"));
+    rig.stops_by(now + 20_000_000, "Unable to update PCA9685 value");
     assert_eq!(rig.mcu.pending_value(), Some("PCA9685"));
     let chip = plug(&rig);
     rig.run_until(now + 40_000_000);
@@ -239,9 +237,7 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     rig.bench.plug_i2c(1, ADDRESS, says_nothing);
     rig.send("config_reset");
     rig.forget_responses();
-    rig.send("allocate_oids count=2");
-    rig.send(OUTPUT);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open and init PCA9685 device"));
+    rig.refuses(&[OUTPUT], "Unable to open and init PCA9685 device");
     let now = rig.now();
     rig.run_until(now + 30_000_000);
     rig.send("config_reset");

@@ -32,8 +32,7 @@ fn a_host_that_falls_silent_is_noticed_after_max_duration_and_the_output_goes_of
     rig.send("queue_pwm_out oid=0 clock=@1000 value=16384");
     rig.run_until(100_999);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(200_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Missed scheduling of next hard pwm event"));
+    rig.stops_by(200_000, "Missed scheduling of next hard pwm event");
     assert_eq!(values(&rig), [(1000, 16384), (101_000, 0)]);
 }
 
@@ -42,14 +41,12 @@ fn a_change_beyond_max_duration_is_refused() {
     let text = "Scheduled pwm event will exceed max_duration";
     let mut rig = Rig::configured(&[HEATER]);
     rig.send_all(&["queue_pwm_out oid=0 clock=@1000 value=1", "queue_pwm_out oid=0 clock=@101001 value=1"]);
-    rig.run_until(2_000);
-    assert_eq!(rig.shutdown().as_deref(), Some(text));
+    rig.stops_by(2_000, text);
 
     let mut rig = Rig::configured(&[HEATER]);
     rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
     rig.run_until(2_000);
-    rig.send("queue_pwm_out oid=0 clock=@101001 value=1");
-    assert_eq!(rig.shutdown().as_deref(), Some(text));
+    rig.stops_on("queue_pwm_out oid=0 clock=@101001 value=1", text);
 }
 
 #[test]
@@ -57,8 +54,7 @@ fn a_channel_that_fails_stops_the_mcu() {
     let mut rig = Rig::configured(&[HEATER]);
     rig.bench.state().broken.insert(PWM);
     rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
-    rig.run_until(2_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("PWM write failed"));
+    rig.stops_by(2_000, "PWM write failed");
     let notes = rig.notes();
     let told = notes.iter().any(|note| note.starts_with("trouble: PWM write failed: PWM output oid 0 (pwm0)"));
     assert!(told, "it is still on: {notes:?}");
@@ -101,8 +97,7 @@ fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
     rig.send("set_pwm_out pin=500 cycle_ticks=20000 value=300");
     rig.run_until(20_000);
     rig.send("emergency_stop");
-    rig.run_until(30_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
+    rig.stops_by(30_000, "Command request");
     // Before finalize_config the channel is set up again. Afterwards a worker sets it.
     assert_eq!(values(&rig), [(0, 100), (0, 200), (12_000, 300)]);
     assert_eq!(rig.bench.state().pwm_cycles[&PWM], 20_000);
@@ -113,6 +108,5 @@ fn a_channel_that_was_set_and_fails_stops_the_mcu() {
     let mut rig = Rig::with_workers(2000, &[SET]);
     rig.bench.state().broken.insert(PWM);
     rig.send(SET);
-    rig.run_until(10_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("PWM write failed"));
+    rig.stops_by(10_000, "PWM write failed");
 }

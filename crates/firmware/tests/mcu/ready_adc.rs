@@ -176,10 +176,8 @@ fn a_probe_triggers_when_its_sample_was_read() {
             "trsync_start oid=4 report_clock=@0 report_ticks=0 expire_reason=2",
             "trigger_analog_home oid=3 trsync_oid=4 trigger_reason=1 error_reason=40 clock=@50000 monitor_ticks=100000 monitor_max=3",
         ]);
-        rig.run_until(5 * PERIOD + 1999);
-        assert_eq!(rig.responses(), [""; 0]);
-        rig.run_until(5 * PERIOD + 2000);
-        assert_eq!(rig.responses(), ["trsync_state oid=4 can_trigger=0 trigger_reason=1 clock=@502000"]);
+        rig.sends_until(5 * PERIOD + 1999, &[]);
+        rig.sends_until(5 * PERIOD + 2000, &["trsync_state oid=4 can_trigger=0 trigger_reason=1 clock=@502000"]);
         assert_eq!(
             rig.ask("trigger_analog_query_state oid=3"),
             "trigger_analog_state oid=3 homing=0 homing_clock=@502000"
@@ -228,8 +226,7 @@ fn a_bus_that_fails_stops_the_mcu_and_it_can_be_configured_anew() {
         rig.send(&query(sensor));
         rig.run_until(3 * PERIOD);
         rig.bench.state().broken.insert(SPI_CHIPS);
-        rig.run_until(5 * PERIOD);
-        assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+        rig.stops_by(5 * PERIOD, "Unable to issue spi ioctl");
         let note = rig.notes().pop().unwrap();
         assert!(note.contains("oid 1 (gpio10)") && note.contains("plug it in again"), "{note}");
         rig.bench.state().broken.clear();
@@ -272,24 +269,24 @@ fn a_reading_that_a_stop_overtakes_sends_nothing() {
 #[test]
 fn channels_that_no_chip_has_are_refused() {
     for (channel, num_channels) in [(0, 0), (0, 1), (2, 2), (0, 5), (4, 4), (255, 4)] {
-        let mut rig = Rig::new();
-        rig.send_all(&["allocate_oids count=2", "config_spi_without_cs oid=0"]);
-        rig.send(&format!(
-            "config_ads131m0x oid=1 spi_oid=0 channel={channel} num_channels={num_channels} data_ready_pin=10"
-        ));
-        assert_eq!(rig.shutdown().as_deref(), Some("Invalid ads131m0x channels configuration"));
+        Rig::new().refuses(
+            &[
+                "config_spi_without_cs oid=0",
+                &format!(
+                    "config_ads131m0x oid=1 spi_oid=0 channel={channel} num_channels={num_channels} data_ready_pin=10"
+                ),
+            ],
+            "Invalid ads131m0x channels configuration",
+        );
     }
 }
 
 #[test]
 fn a_sensor_needs_an_spi_device_and_a_line_that_can_be_looked_at() {
-    let mut rig = Rig::new();
-    rig.send_all(&["allocate_oids count=2", "config_trsync oid=0", ADS1220]);
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    Rig::new().refuses(&["config_trsync oid=0", ADS1220], "Invalid oid type");
     let mut rig = Rig::new();
     rig.bench.state().sleeping.insert(READY);
-    rig.send_all(&["allocate_oids count=2", "config_spi_without_cs oid=0", ADS131M02]);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open in GPIO chip line"));
+    rig.refuses(&["config_spi_without_cs oid=0", ADS131M02], "Unable to open in GPIO chip line");
 }
 
 #[test]

@@ -69,8 +69,10 @@ fn a_step_pin_is_refused_with_the_reason() {
         let mut rig = Rig::new();
         rig.bench.state().sleeping.insert(PIN);
         rig.send("allocate_oids count=1");
-        rig.send(&format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100"));
-        assert_eq!(rig.shutdown().as_deref(), Some("Unable to open out GPIO chip line"));
+        rig.stops_on(
+            &format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100"),
+            "Unable to open out GPIO chip line",
+        );
         let notes = rig.notes();
         let named = |note: &String| ["gpio50", "behind a bus", "choose"].iter().all(|word| note.contains(word));
         assert!(notes.iter().any(named), "{notes:?}");
@@ -131,8 +133,7 @@ fn a_chip_that_fails_stops_the_mcu_and_is_tried_until_it_answers() {
     let mut rig = rig(&[FAN]);
     rig.send("update_digital_out oid=0 value=1");
     rig.bench.state().broken.insert(PIN);
-    rig.send("update_digital_out oid=0 value=0");
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
+    rig.stops_on("update_digital_out oid=0 value=0", "GPIO line write failed");
     rig.run_until(40_000_000);
     assert_eq!(rig.mcu.pending_value(), Some("digital output oid 0 (gpio50)"));
     rig.bench.state().broken.clear();
@@ -210,14 +211,12 @@ fn one_failed_look_ends_no_homing_and_three_do_at_once() {
     home(&mut rig, 10_000);
     rig.run_until(100_000);
     rig.bench.state().nacks.insert(PIN + 1, 2);
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
+    rig.sends_until(1_000_000, &["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
     let mut rig = self::rig(HOMING);
     home(&mut rig, 10_000);
     rig.run_until(100_000);
     rig.bench.state().nacks.insert(PIN + 1, 3);
-    rig.run_until(130_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(130_000, "GPIO line read failed");
     let notes = rig.notes();
     assert!(notes.iter().any(|note| note.contains("endstop oid 2 (gpio51): pin 51 is gone: plug")), "{notes:?}");
 }
@@ -230,8 +229,7 @@ fn a_homing_whose_chip_hangs_stops_the_mcu_after_100_ms() {
     rig.bench.state().answer_ticks = 500_000_000;
     rig.run_until(110_000 + UNREAD_LIMIT - 1);
     assert_eq!(rig.shutdown(), None);
-    rig.run_until(110_000 + UNREAD_LIMIT);
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.stops_by(110_000 + UNREAD_LIMIT, "GPIO line read failed");
     let notes = rig.notes();
     let said = "endstop oid 2 (gpio51): gpio51 has not answered for 100 ms: ";
     assert!(notes.iter().any(|note| note.contains(said)), "{notes:?}");
@@ -272,8 +270,7 @@ fn a_driver_that_took_its_time_to_give_up_is_not_asked_again() {
     let mut rig = rig(&[FAN]);
     rig.bench.state().fail_ticks = 1_250_000;
     rig.bench.state().nacks.insert(PIN, 1);
-    rig.send("update_digital_out oid=0 value=1");
-    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
+    rig.stops_on("update_digital_out oid=0 value=1", "GPIO line write failed");
 }
 
 #[test]
@@ -285,9 +282,7 @@ fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
     rig.run_until(20_000);
     rig.send_all(&["emergency_stop", "config_reset"]);
     rig.forget_responses();
-    rig.send("allocate_oids count=20");
-    rig.send(HOMING[0]);
-    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open in GPIO chip line"));
+    rig.refuses(&[HOMING[0]], "Unable to open in GPIO chip line");
     rig.send("config_reset");
     let is_held = |rig: &Rig| rig.bench.state().held.contains(&(PIN + 1));
     rig.run_until(600_000_000);

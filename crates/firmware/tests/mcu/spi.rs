@@ -34,8 +34,7 @@ fn a_transfer_has_the_devices_mode_and_rate_and_its_answer() {
 fn a_transfer_that_no_worker_takes_is_not_lost() {
     let mut rig = Rig::configured(&["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=1 mode=3 rate=5000000"]);
     rig.bench.state().refuses = true;
-    rig.send("spi_transfer oid=0 data=00");
-    assert_eq!(rig.shutdown().as_deref(), Some("Bus worker queue overflow"));
+    rig.stops_on("spi_transfer oid=0 data=00", "Bus worker queue overflow");
     rig.bench.state().refuses = false;
     rig.forget_responses();
     rig.send("clear_shutdown");
@@ -107,15 +106,12 @@ fn a_wrong_mode_or_a_second_bus_is_refused() {
         assert_eq!(rig.shutdown().as_deref(), Some("Invalid spi config"), "mode {mode}");
     }
     let mut rig = Rig::configured(&["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000"]);
-    rig.send("spi_set_bus oid=0 spi_bus=1 mode=0 rate=1000000");
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid spi config"));
+    rig.stops_on("spi_set_bus oid=0 spi_bus=1 mode=0 rate=1000000", "Invalid spi config");
 }
 
 #[test]
 fn a_shutdown_message_needs_a_device() {
-    let mut rig = Rig::new();
-    rig.send_all(&["allocate_oids count=5", "config_spi_shutdown oid=1 spi_oid=0 shutdown_msg=01"]);
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    Rig::new().refuses(&["config_spi_shutdown oid=1 spi_oid=0 shutdown_msg=01"], "Invalid oid type");
 }
 
 #[test]

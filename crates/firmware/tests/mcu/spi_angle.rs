@@ -70,8 +70,7 @@ fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
         let mut rig = rig(chip, 10, 0);
         plug(&rig, chip);
         rig.send("query_spi_angle oid=1 clock=@1000 rest_ticks=20000 time_shift=2");
-        rig.run_until(1000 + 16 * 20_000);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(1000 + 16 * 20_000, &[]);
         rig.run_until(1000 + 17 * 20_000 - 1);
         let sent: Vec<String> =
             rig.bench.transfers().iter().map(|transfer| pinion_testbench::rig::hex(&transfer.data)).collect();
@@ -109,8 +108,7 @@ fn messages_are_counted_from_zero_in_each_query() {
             rig.responses().iter().map(|response| response.split(' ').nth(2).unwrap().to_owned()).collect();
         assert_eq!(sequences, ["sequence=0", "sequence=1"]);
         rig.send("query_spi_angle oid=1 clock=@0 rest_ticks=0 time_shift=0");
-        rig.run_until(start + 900_000);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(start + 900_000, &[]);
     }
 }
 
@@ -255,8 +253,7 @@ fn a_bus_that_fails_stops_the_mcu() {
         let mut rig = rig(TLE5012B, 0, 0);
         rig.bench.state().broken.insert(SPI_CHIPS);
         rig.send(command);
-        rig.run_until(2000);
-        assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+        rig.stops_by(2000, "Unable to issue spi ioctl");
         assert!(rig.notes().iter().any(|note| note.contains("angle sensor oid 1")));
     }
 }
@@ -271,11 +268,9 @@ fn what_can_not_be_is_refused() {
     ] {
         let mut rig = Rig::new();
         let angle = format!("config_spi_angle oid=1 spi_oid=0 spi_angle_type={chip}");
-        rig.send_all(&["allocate_oids count=5", device, &angle]);
-        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        rig.refuses(&[device, &angle], text);
     }
     let mut rig = rig(A1333, 0, 0);
     rig.run_until(1000);
-    rig.send("query_spi_angle oid=1 clock=@999 rest_ticks=1000 time_shift=0");
-    assert_eq!(rig.shutdown().as_deref(), Some("Timer too close"));
+    rig.stops_on("query_spi_angle oid=1 clock=@999 rest_ticks=1000 time_shift=0", "Timer too close");
 }

@@ -97,8 +97,7 @@ fn the_third_bad_value_in_a_row_stops_the_mcu() {
         );
         let note = rig.notes().pop().unwrap();
         assert!(note.contains("MAX6675") && note.contains("3 times in a row"), "{note}");
-        rig.run_until(1_000_000);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(1_000_000, &[]);
     }
 }
 
@@ -118,8 +117,7 @@ fn the_limits_of_the_range_are_in_it() {
 fn a_slow_bus_delays_a_result_and_not_its_time() {
     let (mut rig, _) = with_word(3000, 400);
     rig.send(QUERY);
-    rig.run_until(3999);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(3999, &[]);
     rig.run_until(24_000);
     assert_eq!(rig.responses(), [reading(11_000, 400, 0), reading(21_000, 400, 0), reading(31_000, 400, 0)]);
 }
@@ -143,8 +141,7 @@ fn an_answer_to_an_earlier_query_is_not_told() {
     // There is none after a stop either.
     rig.run_until(19_000);
     rig.send("emergency_stop");
-    rig.run_until(100_000);
-    assert_eq!(rig.responses(), ["shutdown clock=@19000 static_string_id=Command request"]);
+    rig.sends_until(100_000, &["shutdown clock=@19000 static_string_id=Command request"]);
 }
 
 #[test]
@@ -154,8 +151,7 @@ fn a_query_without_rest_ends_it() {
     rig.run_until(1000);
     rig.responses();
     rig.send("query_thermocouple oid=1 clock=@0 rest_ticks=0 min_value=0 max_value=0 max_invalid_count=0");
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(1_000_000, &[]);
 }
 
 #[test]
@@ -163,8 +159,7 @@ fn a_bus_that_fails_stops_the_mcu_and_it_can_be_configured_anew() {
     let (mut rig, _) = with_word(500, 400);
     rig.send(QUERY);
     rig.bench.state().broken.insert(SPI_CHIPS);
-    rig.run_until(5000);
-    assert_eq!(rig.responses(), ["shutdown clock=@1500 static_string_id=Unable to issue spi ioctl"]);
+    rig.sends_until(5000, &["shutdown clock=@1500 static_string_id=Unable to issue spi ioctl"]);
     rig.bench.state().broken.clear();
     rig.send("config_reset");
     rig.configure(&[
@@ -191,6 +186,5 @@ fn what_can_not_be_configured() {
     // A device whose bus was never set.
     let mut rig = Rig::configured(&["config_spi_without_cs oid=0", &config(0, 0)]);
     rig.send(QUERY);
-    rig.run_until(2000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"));
+    rig.stops_by(2000, "Invalid oid type");
 }

@@ -239,8 +239,7 @@ fn commands_and_steps_do_not_wait_for_a_message() {
 fn a_message_too_long_stops_the_mcu() {
     for command in ["tmcuart_send oid=0 write=0102030405060708090a0b read=0", "tmcuart_send oid=0 write=00 read=11"] {
         let mut rig = Rig::configured(&[TWO_WIRES]);
-        rig.send(command);
-        assert_eq!(rig.shutdown().as_deref(), Some("tmcuart data too large"));
+        rig.stops_on(command, "tmcuart data too large");
     }
 }
 
@@ -250,10 +249,8 @@ fn a_shutdown_leaves_the_line_high_and_says_nothing_more() {
         let mut rig = Rig::configured(&[ONE_WIRE]);
         rig.send(&send(READ_IFCNT, 10));
         rig.run_until(at);
-        rig.send("emergency_stop");
-        assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
-        rig.run_until(1_000_000);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.stops_on("emergency_stop", "Command request");
+        rig.sends_until(1_000_000, &[]);
         assert!(rig.bench.level(TX) && !rig.mcu.has_pending_values());
         assert!(matches!(rig.bench.state().directions[&TX], Direction::Output { level: true, .. }));
         // The UART works in the next configuration.
@@ -273,8 +270,7 @@ fn a_line_that_is_gone_stops_the_mcu() {
         let mut rig = Rig::configured(&[TWO_WIRES]);
         rig.bench.state().broken.insert(pin);
         rig.send(&send(READ_IFCNT, 10));
-        rig.run_until(1_000_000);
-        assert_eq!(rig.shutdown().as_deref(), Some(reason));
+        rig.stops_by(1_000_000, reason);
         rig.bench.state().broken.clear();
         rig.run_until(10_000_000);
         assert!(!rig.mcu.has_pending_values() && rig.bench.level(TX));
@@ -348,8 +344,7 @@ fn a_port_has_its_answer_as_soon_as_the_last_byte_came() {
     rig.send(&send(READ_IFCNT, 10));
     // Four bytes, their echo, and eight bytes.
     let end = QUIET + (4 + 4 + 8) * 10 * BIT;
-    rig.run_until(end - 1);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.sends_until(end - 1, &[]);
     rig.run_until(end);
     assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
     // A message without a reply has its answer with its echo.
@@ -366,8 +361,7 @@ fn without_a_whole_reply_a_port_answers_nothing() {
         let mut next = [comes.to_vec(), [READ_IFCNT, IFCNT].concat()].into_iter();
         let (mut rig, _) = port(move |_| next.next().unwrap());
         rig.send(&send(READ_IFCNT, 10));
-        rig.run_until(QUIET + PORT_LIMIT);
-        assert_eq!(rig.responses(), [""; 0]);
+        rig.sends_until(QUIET + PORT_LIMIT, &[]);
         rig.run_until(QUIET + 2 * PORT_LIMIT + 600 * BIT);
         assert_eq!(rig.responses(), [response(&[])], "{comes:x?}");
         rig.send(&send(READ_IFCNT, 10));
@@ -407,10 +401,8 @@ fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
     let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
     rig.send(&send(READ_IFCNT, 10));
     rig.run_until(QUIET + 5 * BIT);
-    rig.send("emergency_stop");
-    assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
-    rig.run_until(10_000_000);
-    assert_eq!(rig.responses(), [""; 0]);
+    rig.stops_on("emergency_stop", "Command request");
+    rig.sends_until(10_000_000, &[]);
     assert!(!rig.mcu.has_pending_values());
 }
 
@@ -430,8 +422,7 @@ fn a_port_that_cannot_be_used_is_refused() {
         if broken {
             rig.bench.state().broken.insert(SERIAL);
         }
-        rig.send_all(&["allocate_oids count=1", &format!("config_tmcuart oid=0 {config} bit_time=1250")]);
-        assert_eq!(rig.shutdown().as_deref(), Some(reason));
+        rig.refuses(&[&format!("config_tmcuart oid=0 {config} bit_time=1250")], reason);
         let notes = rig.notes();
         assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
     }

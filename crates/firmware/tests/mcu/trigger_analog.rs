@@ -99,8 +99,10 @@ fn each_type_triggers_at_its_value() {
 #[test]
 fn a_type_that_the_dictionary_does_not_have_is_refused() {
     let mut rig = homing(1000, GT, 100, &[1000]);
-    rig.send("trigger_analog_set_trigger oid=4 trigger_analog_type=3 trigger_value=0");
-    assert_eq!(rig.shutdown().as_deref(), Some("Invalid trigger_analog_type"));
+    rig.stops_on(
+        "trigger_analog_set_trigger oid=4 trigger_analog_type=3 trigger_value=0",
+        "Invalid trigger_analog_type",
+    );
 }
 
 #[test]
@@ -252,6 +254,5 @@ fn what_is_named_must_be_of_its_kind() {
 fn homing_that_begins_in_the_past_is_too_close() {
     let mut rig = Rig::configured(OBJECTS);
     rig.run_until(50_000);
-    rig.send("trigger_analog_home oid=4 trsync_oid=1 trigger_reason=1 error_reason=2 clock=@49999 monitor_ticks=1 monitor_max=1");
-    assert_eq!(rig.shutdown().as_deref(), Some("Timer too close"));
+    rig.stops_on("trigger_analog_home oid=4 trsync_oid=1 trigger_reason=1 error_reason=2 clock=@49999 monitor_ticks=1 monitor_max=1", "Timer too close");
 }

@@ -604,6 +604,7 @@ mod tests {
             rig.transfer(7);
             rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
             rig.wait_until("the transfer is under way", |rig| rig.bench.hangs());
+            rig.wait_until("the command behind it waits", |rig| rig.progress.is_held());
             rig
         }
 
@@ -653,6 +654,12 @@ mod tests {
 
         fn is_stopped(&self) -> bool {
             !self.said("shutdown clock=%u static_string_id=%hu").is_empty()
+        }
+
+        /// Waits until the link, which sleeps, is woken.
+        fn wait_until_link_wakes(&self) {
+            let mut fds = [PollFd::new(self.wake.event(), PollFlags::POLLIN)];
+            assert_eq!(poll(&mut fds, 60_000u16), Ok(1), "the link is not told");
         }
 
         fn wait_until(&self, what: &str, holds: impl Fn(&Rig) -> bool) {
@@ -715,8 +722,7 @@ mod tests {
         rig.wait_until("all blocks are done", |rig| rig.progress.done() == CONFIGURATION + 3);
         assert_eq!(rig.said(RESPONSE), [[0, 1, !7]]);
         assert!(rig.bench.level(30));
-        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
-        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        rig.wait_until_link_wakes();
         for byte in 0..20 {
             rig.transfer(byte);
         }
@@ -756,8 +762,7 @@ mod tests {
         let first = rig.encode("update_digital_out oid=%c value=%c", &[1, 1]);
         rig.requests.push(Request::Run(first)).ok().unwrap();
         rig.transfer(7);
-        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
-        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        rig.wait_until_link_wakes();
         rig.wait_until("the transfer is under way", |rig| rig.bench.hangs());
         assert_eq!(rig.progress.done(), CONFIGURATION + 1);
         assert_eq!(rig.quit(), Left::Safe);
@@ -768,8 +773,8 @@ mod tests {
         let mut rig = Rig::new();
         rig.wake.sleeping();
         rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
-        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
-        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the host waits for its acknowledgement");
+        // The host waits for its acknowledgement.
+        rig.wait_until_link_wakes();
         assert_eq!(rig.progress.done(), CONFIGURATION + 1);
         assert_eq!(rig.quit(), Left::Safe);
     }

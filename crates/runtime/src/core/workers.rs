@@ -290,6 +290,16 @@ mod tests {
         }
     }
 
+    /// Makes slow jobs of a number. They go on when the sender is dropped. The receiver ends with the last job.
+    fn slow() -> (impl Fn(u8) -> Box<dyn AnyJob>, Sender<()>, Receiver<u8>) {
+        let (release, go_on) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let job =
+            move |number| -> Box<dyn AnyJob> { Box::new(Slow { go_on: go_on.clone(), number, said: said.clone() }) };
+        (job, release, heard)
+    }
+
     /// A clock on which each look takes a microsecond.
     #[derive(Default)]
     struct Looks(AtomicU64);
@@ -364,42 +374,34 @@ mod tests {
 
     fn threads() -> Threads {
         let clock = Monotonic::start();
-        {
-            let heartbeat = Heartbeat::new(clock).unwrap();
-            Threads::new(Arc::default(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
-        }
+        let heartbeat = Heartbeat::new(clock).unwrap();
+        Threads::new(Arc::default(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
     }
 
     #[test]
     fn what_was_asked_for_before_the_end_is_done_in_order() {
-        let (release, go_on) = mpsc::channel();
-        let (said, heard) = mpsc::channel();
-        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let (job, release, heard) = slow();
         let mut threads = threads();
         let worker = threads.start("pwm").unwrap();
         assert_eq!(threads.start("pwm").unwrap(), worker);
         for number in 0..5 {
-            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
-            submit(&mut threads, worker, Box::new(slow), false);
+            submit(&mut threads, worker, job(number), false);
         }
         drop(release);
         threads.reset();
-        drop(said);
+        drop(job);
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
     }
 
     #[test]
     fn a_worker_that_hangs_is_left_behind_and_lets_go_of_all_once_it_is_back() {
-        let (release, go_on) = mpsc::channel();
-        let (said, heard) = mpsc::channel();
-        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let (job, release, heard) = slow();
         let mut threads = threads();
         let worker = threads.start("i2c1").unwrap();
         for number in 0..2 {
-            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
-            submit(&mut threads, worker, Box::new(slow), false);
+            submit(&mut threads, worker, job(number), false);
         }
-        drop(said);
+        drop(job);
         threads.reset();
         assert!(!threads.has_completion());
         // Another one takes its place.
@@ -411,14 +413,12 @@ mod tests {
 
     #[test]
     fn a_worker_that_only_reads_is_not_waited_for() {
-        let (release, go_on) = mpsc::channel();
-        let (said, heard) = mpsc::channel();
-        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let (job, release, heard) = slow();
         let mut threads = threads();
         let worker = threads.start("w1 28-1").unwrap();
         threads.leave_behind(worker);
         let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
-        submit(&mut threads, worker, Box::new(Slow { go_on, number: 7, said }), false);
+        submit(&mut threads, worker, job(7), false);
         // A job that is not under way yet would be dropped.
         while waiting(&threads) > 0 {
             thread::sleep(Duration::from_millis(1));

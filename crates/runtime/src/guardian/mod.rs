@@ -270,6 +270,13 @@ mod tests {
     }
 
     impl Guarded {
+        /// Starts it, kills it, and waits until its guardian has ended.
+        fn killed(script: &str) -> Guarded {
+            let mut guarded = Guarded::start(script);
+            guarded.kill();
+            guarded
+        }
+
         fn start(script: &str) -> Guarded {
             let folder = tempfile::tempdir().unwrap();
             let file = folder.path().join("output");
@@ -377,32 +384,26 @@ mod tests {
         assert_eq!(guarded.output(), "off");
     }
 
+    /// An output that is given again goes to the later value. A guardian without memory for threads drives it all the
+    /// same.
     #[test]
-    fn an_output_that_is_given_again_goes_to_the_later_value() {
-        let mut guarded = Guarded::start("again");
-        guarded.kill();
-        assert_eq!(guarded.output(), "off");
-        assert!(guarded.log().contains("all 1 outputs are driven"));
+    fn an_output_goes_to_its_last_shutdown_value_also_without_memory_for_threads() {
+        for script in ["again", "cramped"] {
+            let guarded = Guarded::killed(script);
+            assert_eq!(guarded.output(), "off", "{script}");
+            assert!(guarded.log().contains("all 1 outputs are driven"), "{script}: {}", guarded.log());
+        }
     }
 
     #[test]
     fn an_output_that_can_not_be_driven_is_named() {
-        let mut guarded = Guarded::start("readonly");
-        guarded.kill();
+        let guarded = Guarded::killed("readonly");
         let log = guarded.log();
         assert!(
             log.contains("still not at its shutdown value: pwmchip7/pwm0: Bad file descriptor (os error 9)"),
             "{log}"
         );
         assert!(log.contains("only 0 of 1 outputs are driven") && log.contains("switch the power off"), "{log}");
-    }
-
-    #[test]
-    fn a_guardian_without_memory_for_threads_drives_the_outputs_all_the_same() {
-        let mut guarded = Guarded::start("cramped");
-        guarded.kill();
-        assert_eq!(guarded.output(), "off");
-        assert!(guarded.log().contains("all 1 outputs are driven"));
     }
 
     #[test]
@@ -446,8 +447,7 @@ mod tests {
 
     #[test]
     fn outputs_that_were_given_back_stay_as_they_are() {
-        let mut guarded = Guarded::start("release");
-        guarded.kill();
+        let guarded = Guarded::killed("release");
         assert_eq!(guarded.output(), "on ");
     }
 

@@ -2,6 +2,7 @@
 //! Lines of an I/O expander: an I2C chip with a driver that sleeps during a transfer.
 
 use std::fs;
+use std::ops::Range;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -114,9 +115,9 @@ fn output(oid: usize, pin: &str) -> String {
     format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration=0")
 }
 
-/// A heater on a line of the processor and a fan on the expander, both on.
+/// A program that has both a heater on a line of the processor and a fan on the expander. Dropped in this order.
 struct Setup {
-    /// The first field, because it is dropped first.
+    program: Program,
     expander: Expander,
     sim: GpioSim,
     /// The kernel's number of the heater's line. It cannot be read while the chip hangs, because the kernel then reads
@@ -125,9 +126,13 @@ struct Setup {
 }
 
 impl Setup {
-    fn new() -> Setup {
-        let sim = GpioSim::new("lab", 8);
-        Setup { heater: sim.kernel_number(0), expander: Expander::new(), sim }
+    /// Both are on.
+    fn on() -> (Setup, Client) {
+        let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+        let setup = Setup { program: Program::start(), expander, heater: sim.kernel_number(0), sim };
+        let mut client = setup.program.connect();
+        setup.switch_on(&mut client);
+        (setup, client)
     }
 
     fn switch_on(&self, client: &mut Client) {
@@ -137,13 +142,19 @@ impl Setup {
         assert!(self.sim.level(0) && self.expander.level(3));
     }
 
-    /// Waits until the heater, which was on, is switched off. Returns the time (CLOCK_MONOTONIC, microseconds).
-    fn heater_off_us(&self, trace: &Trace) -> u64 {
+    /// The fan's name in the log.
+    fn fan(&self) -> String {
+        format!("digital output oid 1 ({})", self.expander.pin(3))
+    }
+
+    /// Waits until the heater, which was on, is switched off: within this time after `began_us` (CLOCK_MONOTONIC).
+    fn assert_heater_off(&self, trace: &Trace, began_us: u64, within_us: u64) {
         let first = || trace.writes_to(self.heater).first().copied();
         sysfs::wait_until("the heater is switched off", || first().is_some());
         let Write { level, at_ns, .. } = first().expect("a write");
-        assert!(!level);
-        at_ns / 1000
+        let took_us = at_ns / 1000 - began_us;
+        println!("the heater is off after {took_us} us");
+        assert!(!level && took_us < within_us, "{took_us} us");
     }
 
     /// A restarted program gets all lines when the chip's driver is free.
@@ -156,11 +167,6 @@ impl Setup {
 
 fn now_us() -> u64 {
     monotonic().as_micros() as u64
-}
-
-/// The fan's name in the log.
-fn fan(setup: &Setup) -> String {
-    format!("digital output oid 1 ({})", setup.expander.pin(3))
 }
 
 #[test]
@@ -192,6 +198,7 @@ fn steps_beside_a_slow_output_are_in_time() {
     run(client, "update_digital_out oid=1 value=1");
     assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
     thread::sleep(Duration::from_millis(500));
+    sysfs::wait_until("all steps are made", || trace.writes_to(step).len() >= 2000);
     let edges = trace.writes_to(step);
     let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
     assert_eq!(rising.len(), 1000);
@@ -256,30 +263,25 @@ fn an_axis_homes_to_an_endstop_on_it() {
 
 #[test]
 fn an_emergency_stop_waits_for_no_chip_that_hangs() {
-    let setup = Setup::new();
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    setup.switch_on(client);
+    let (mut setup, mut client) = Setup::on();
     let trace = Trace::start();
-    let guardian = program.guardian();
+    let guardian = setup.program.guardian();
     let hangs = setup.expander.slow_down(HANGS_MS);
     let began_us = now_us();
     client.send_line("emergency_stop").expect("a session");
-    let off_us = setup.heater_off_us(&trace);
-    println!("the heater is off after {} us", off_us - began_us);
-    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
+    setup.assert_heater_off(&trace, began_us, 50_000);
     // Only the fan's shutdown value is missing, and the guardian handles it.
-    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
+    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
     // One second for a shutdown value, two for the program's end, two for the chip.
     let acted_us = now_us() - began_us;
     println!("killed, and the chip given up, after {acted_us} us");
     assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
-    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
-    assert!(!exists(program.pid()), "it is killed while the chip still hangs");
+    setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
+    assert!(!exists(setup.program.pid()), "it is killed while the chip still hangs");
     sysfs::wait_until("the guardian ends", || !exists(guardian));
     assert!(now_us() - began_us < 1000 * HANGS_MS);
     drop(hangs);
-    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
     // The write that hung completes in the end.
     setup.expander.wait_until_free();
     assert!(!setup.expander.level(3));
@@ -289,26 +291,21 @@ fn an_emergency_stop_waits_for_no_chip_that_hangs() {
 
 #[test]
 fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
-    let setup = Setup::new();
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    setup.switch_on(client);
+    let (mut setup, mut client) = Setup::on();
     let trace = Trace::start();
-    let guardian = program.guardian();
+    let guardian = setup.program.guardian();
     let hangs = setup.expander.slow_down(HANGS_MS);
     // A worker is in the driver while the MCU continues to run.
     let at = client.clock_in(0.1).expect("the clock").wire();
-    run(client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
+    run(&mut client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
     thread::sleep(Duration::from_secs(2));
-    assert!(setup.sim.level(0) && program.is_running());
+    assert!(setup.sim.level(0) && setup.program.is_running());
     let began_us = now_us();
-    program.signal(Signal::SIGKILL);
-    let off_us = setup.heater_off_us(&trace);
-    println!("the heater is off after {} us", off_us - began_us);
-    assert!(off_us - began_us < WITHIN_US, "{} us", off_us - began_us);
-    program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
+    setup.program.signal(Signal::SIGKILL);
+    setup.assert_heater_off(&trace, began_us, WITHIN_US);
+    setup.program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
-    assert!(!exists(program.pid()));
+    assert!(!exists(setup.program.pid()));
     drop(hangs);
     drop(trace);
     setup.assert_starts_anew();
@@ -316,66 +313,57 @@ fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
 
 #[test]
 fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
-    let setup = Setup::new();
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    setup.switch_on(client);
+    let (mut setup, mut client) = Setup::on();
     let silent = setup.expander.fall_silent();
     client.send_line("update_digital_out oid=1 value=0").expect("a session");
-    assert_eq!(shutdown_of(client), "GPIO line write failed");
+    assert_eq!(shutdown_of(&mut client), "GPIO line write failed");
     assert!(!setup.sim.level(0), "the heater is off");
-    let line = setup.expander.line(3);
-    program.wait_for_line(&["shutdown: GPIO line write failed", &fan(&setup), &line, "its chip does not answer"]);
+    let (line, fan) = (setup.expander.line(3), setup.fan());
+    let program = &mut setup.program;
+    program.wait_for_line(&["shutdown: GPIO line write failed", &fan, &line, "its chip does not answer"]);
     thread::sleep(Duration::from_millis(300));
     assert!(!program.log().contains("after all"));
     drop(silent);
-    program.wait_for_line(&[&fan(&setup), "is at its shutdown value after all"]);
+    program.wait_for_line(&[&fan, "is at its shutdown value after all"]);
     assert!(!setup.expander.level(3));
     // No help was necessary.
     thread::sleep(Duration::from_secs(2));
     assert!(program.is_running());
     assert!(!program.log().contains("guardian"), "{}", program.log());
     client.reset().expect("a reset");
-    setup.switch_on(client);
+    setup.switch_on(&mut client);
 }
 
 #[test]
 fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
-    let setup = Setup::new();
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    setup.switch_on(client);
+    let (mut setup, mut client) = Setup::on();
     let silent = setup.expander.fall_silent();
     let began_us = now_us();
     client.send_line("update_digital_out oid=1 value=0").expect("a session");
-    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
     let killed_us = now_us() - began_us;
     println!("killed after {killed_us} us");
     assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
-    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
-    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
+    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
+    setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
     drop(silent);
     setup.assert_starts_anew();
 }
 
 #[test]
 fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
-    let setup = Setup::new();
-    let mut program = Program::start();
-    setup.switch_on(&mut program.connect());
-    let guardian = program.guardian();
+    let (mut setup, _) = Setup::on();
+    let guardian = setup.program.guardian();
     let silent = setup.expander.fall_silent();
     let trace = Trace::start();
     let began_us = now_us();
-    program.signal(Signal::SIGTERM);
-    let off_us = setup.heater_off_us(&trace);
-    println!("the heater is off after {} us", off_us - began_us);
-    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
-    assert!(!program.wait().success());
+    setup.program.signal(Signal::SIGTERM);
+    setup.assert_heater_off(&trace, began_us, 50_000);
+    assert!(!setup.program.wait().success());
     // The chip is back while the guardian retries.
     drop(silent);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
-    program.wait_for_line(&["guardian: ", &fan(&setup), "all 2 outputs are driven to their shutdown values"]);
+    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "all 2 outputs are driven to their shutdown values"]);
     assert!(!setup.expander.level(3));
     drop(trace);
     setup.assert_starts_anew();
@@ -405,6 +393,17 @@ fn pulses_at_an_expander_are_polled() {
     count(1);
     expander.set_inputs(0);
     count(2);
+}
+
+/// A program that reads its inputs from the expander. In this order, the chip is dropped last.
+fn with_inputs() -> (Expander, Program, Client) {
+    let expander = Expander::new();
+    let program = Program::start();
+    let mut client = program.connect();
+    configure_inputs(&mut client, &expander);
+    // Long enough for the first queries.
+    thread::sleep(Duration::from_millis(200));
+    (expander, program, client)
 }
 
 /// Buttons, a homing endstop, a counter and a line of `set_digital_out`.
@@ -442,14 +441,11 @@ fn missed(program: &Program) -> (u64, u64) {
 
 #[test]
 fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
-    let expander = Expander::new();
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure_inputs(client, &expander);
-    thread::sleep(Duration::from_millis(200));
-    for _ in 0..10 {
+    let (expander, program, mut client) = with_inputs();
+    let client = &mut client;
+    for count in 1..=10 {
         expander.miss_one();
-        thread::sleep(Duration::from_millis(20));
+        sysfs::wait_until("the transfer is tried again", || missed(&program) == (count, count));
     }
     for level in [false, true] {
         expander.miss_one();
@@ -467,19 +463,22 @@ fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
     assert_eq!(missed(&program), (13, 13));
 }
 
-#[test]
-fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
-    let expander = Expander::new();
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure_inputs(client, &expander);
-    thread::sleep(Duration::from_millis(200));
+/// The chip falls silent, and the MCU stops after a time in this range, in microseconds.
+fn stops_silent(expander: &Expander, client: &mut Client, after_us: Range<u64>) -> sysfs::Setting {
     let silent = expander.fall_silent();
     let began_us = now_us();
     assert_eq!(shutdown_of(client), "GPIO line read failed");
     let took_us = now_us() - began_us;
     println!("stopped after {took_us} us");
-    assert!((95_000..130_000).contains(&took_us), "{took_us} us");
+    assert!(after_us.contains(&took_us), "{took_us} us");
+    silent
+}
+
+#[test]
+fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
+    let (expander, program, mut client) = with_inputs();
+    let client = &mut client;
+    let silent = stops_silent(&expander, client, 95_000..130_000);
     program.wait_for_line(&[
         "shutdown: GPIO line read failed",
         &expander.chip_name,
@@ -493,10 +492,8 @@ fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
 
 #[test]
 fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
-    let expander = Expander::new();
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure_inputs(client, &expander);
+    let (expander, program, mut client) = with_inputs();
+    let client = &mut client;
     let start = client.clock_in(0.05).expect("the clock").wire();
     run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
     // Every 2 ms.
@@ -507,22 +504,14 @@ fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
         ),
     );
     thread::sleep(Duration::from_millis(200));
-    let _silent = expander.fall_silent();
-    let began_us = now_us();
-    assert_eq!(shutdown_of(client), "GPIO line read failed");
-    let took_us = now_us() - began_us;
-    println!("stopped after {took_us} us");
-    assert!(took_us < 20_000, "{took_us} us");
+    let _silent = stops_silent(&expander, client, 0..20_000);
     program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
 }
 
 #[test]
 fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
-    let expander = Expander::new();
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure_inputs(client, &expander);
-    thread::sleep(Duration::from_millis(200));
+    let (expander, program, mut client) = with_inputs();
+    let client = &mut client;
     let hangs = expander.slow_down(HANGS_MS);
     thread::sleep(Duration::from_millis(50));
     client.reset().expect("a reset");

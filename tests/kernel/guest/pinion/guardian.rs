@@ -63,38 +63,18 @@ fn a_core_that_hangs_is_noticed() {
     let outputs = Outputs::new();
     let log = end_by(&outputs, Signal::SIGUSR2);
     assert!(log.contains("outputs are driven to their shutdown values"), "{log}");
+    assert_starts_anew(&outputs);
+}
+
+/// A program started now gets the lines.
+fn assert_starts_anew(outputs: &Outputs) {
     let program = Program::start();
     outputs.switch_on(&mut program.connect(), 0);
 }
 
-#[test]
-fn a_program_without_its_guardian_stops_and_says_so() {
-    let outputs = Outputs::new();
-    let mut program = Program::start();
-    let mut client = program.connect();
-    outputs.switch_on(&mut client, 0);
-    let trace = Trace::start();
-    outputs.wait_until_on();
-    kill(program.guardian(), Signal::SIGKILL).expect("a guardian");
-    assert_eq!(shutdown_of(&mut client), "Guardian process lost");
-    outputs.assert_safe(&trace);
-    assert_eq!(program.wait().code(), Some(1));
-    program.wait_for_line(&["shutdown: Guardian process lost", "somebody killed the guardian"]);
-    let program = Program::start();
-    outputs.switch_on(&mut program.connect(), 0);
-}
-
-#[test]
-fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
-    let outputs = Outputs::new();
-    let log = end_by(&outputs, Signal::SIGSTOP);
-    assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
-    let program = Program::start();
-    outputs.switch_on(&mut program.connect(), 0);
-}
-
-#[test]
-fn a_guardian_that_is_stopped_counts_as_lost() {
+/// Sends a signal to the guardian, for which the program stops with these words. Returns after how many milliseconds
+/// the outputs are safe.
+fn lose_guardian_by(signal: Signal, words: &str) -> u64 {
     let outputs = Outputs::new();
     let mut program = Program::start();
     let mut client = program.connect();
@@ -103,18 +83,36 @@ fn a_guardian_that_is_stopped_counts_as_lost() {
     let trace = Trace::start();
     outputs.wait_until_on();
     let began_us = monotonic().as_micros() as u64;
-    kill(guardian, Signal::SIGSTOP).expect("a guardian");
+    kill(guardian, signal).expect("a guardian");
     assert_eq!(shutdown_of(&mut client), "Guardian process lost");
     let safe_us = outputs.assert_safe(&trace);
-    // Its last check was at most 550 ms before.
-    let after_ms = (safe_us - began_us) / 1000;
-    println!("safe after {after_ms} ms");
-    assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
     assert_eq!(program.wait().code(), Some(1));
     assert!(!exists(guardian), "it would keep the lines");
-    program.wait_for_line(&["shutdown: Guardian process lost", "no heartbeat: was it stopped?"]);
-    let program = Program::start();
-    outputs.switch_on(&mut program.connect(), 0);
+    program.wait_for_line(&["shutdown: Guardian process lost", words]);
+    assert_starts_anew(&outputs);
+    let after_ms = (safe_us - began_us) / 1000;
+    println!("safe after {after_ms} ms");
+    after_ms
+}
+
+#[test]
+fn a_program_without_its_guardian_stops_and_says_so() {
+    lose_guardian_by(Signal::SIGKILL, "somebody killed the guardian");
+}
+
+#[test]
+fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
+    let outputs = Outputs::new();
+    let log = end_by(&outputs, Signal::SIGSTOP);
+    assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
+    assert_starts_anew(&outputs);
+}
+
+#[test]
+fn a_guardian_that_is_stopped_counts_as_lost() {
+    // Its last check was at most 550 ms before.
+    let after_ms = lose_guardian_by(Signal::SIGSTOP, "no heartbeat: was it stopped?");
+    assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
 }
 
 /// A line that is on, without a limit (`max_duration`). Nothing else would notice lost time.

@@ -41,8 +41,7 @@ fn a_chip_is_set_up_and_its_output_goes_off_at_a_shutdown() {
     forget();
     let at = client.clock_in(0.05).expect("the clock").wire();
     run(client, &format!("queue_pca9685_out oid=0 clock={at} value=4096"));
-    thread::sleep(Duration::from_millis(200));
-    assert_eq!(sent(), ["53 0e 00 10 00 00"]);
+    sysfs::wait_until("the output is on", || sent() == ["53 0e 00 10 00 00"]);
     forget();
     run(client, "emergency_stop");
     sysfs::wait_until("the output is off", || sent() == ["53 0e 00 00 00 10"]);
