@@ -70,6 +70,18 @@ fn a_printer_of_two_boards_is_leveled_and_prints() {
 }
 
 #[test]
+fn printers_of_the_kind_that_users_have_pass_every_step() {
+    let Some(checkout) = checkout("printers_of_the_kind_that_users_have_pass_every_step") else { return };
+    let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kit/printers");
+    for (name, count) in [("voron-2.4", 11), ("ender-3", 9), ("mk3", 8), ("ratrig", 12), ("kossel", 8), ("idex", 7)] {
+        let (passed, steps) = tried(&checkout, &printers.join(format!("{name}.cfg")), &[]);
+        assert!(passed, "{name}: {steps:?}");
+        let tried = steps.iter().filter(|step| step["result"] == "passed").count();
+        assert_eq!(tried, count, "{name}: {steps:?}");
+    }
+}
+
+#[test]
 fn mistakes_have_klippys_own_words() {
     let Some(checkout) = checkout("mistakes_have_klippys_own_words") else { return };
     let dictionary = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dictionaries/klipper-master.json");

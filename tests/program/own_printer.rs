@@ -31,6 +31,9 @@ fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
         "{copy}"
     );
     assert_eq!(fs::read_to_string(&cfg).unwrap(), PRINTER, "the original");
+    let host_temperature = fs::canonicalize(&folder).unwrap().join("host_temperature");
+    assert!(copy.contains(&format!("sensor_path: {}\n", host_temperature.display())), "{copy}");
+    assert_eq!(fs::read_to_string(host_temperature).unwrap(), "45000\n", "in millidegrees");
     let client = pinion.client();
     let pins = format!("{:?}", client.dictionary());
     for pin in ["PB9", "PC2", "PA7"] {
@@ -54,6 +57,42 @@ fn a_mistake_is_one_line_with_its_place_in_klippys_words() {
         assert!(said.len() == 1 && said[0].contains(mistake.words), "{mistake:?}: {place}: {log}");
         assert!(said[0].split(mistake.words).nth(1).unwrap().contains(": "), "no remedy in {log}");
     }
+}
+
+#[test]
+fn a_try_reports_a_mistake_that_is_found_before_klippy_starts() {
+    let mistake = MISTAKES[MISTAKES.len() / 2];
+    let (_home, cfg) = folder_with("printer.cfg", &mistake.text());
+    let cfg = cfg.to_str().unwrap();
+    let (status, out, log) = output(&["sim", cfg, "--try", "--klipper", "/nonexistent", "--json"]);
+    assert_eq!(status, Some(1), "{log}");
+    let report: serde_json::Value = serde_json::from_str(&out).expect(&log);
+    assert_eq!((&report["passed"], &report["folder"]), (&false.into(), &serde_json::Value::Null));
+    let step = &report["steps"][0];
+    assert_eq!((&step["step"], &step["result"]), (&"read".into(), &"failed".into()));
+    assert_eq!((&step["file"], &step["line"]), (&cfg.into(), &mistake.line().into()));
+    let text = step["text"].as_str().unwrap();
+    assert!(text.contains(mistake.words) && !text.contains(cfg), "{text}");
+    let (status, out, _) = output(&["sim", cfg, "--try", "--klipper", "/nonexistent"]);
+    assert_eq!(status, Some(1));
+    assert!(out.starts_with(&format!("FAIL  read         {cfg}:{}: ", mistake.line())), "{out}");
+    assert!(out.contains("does NOT work here: read failed"), "{out}");
+}
+
+#[test]
+fn printers_of_the_kind_that_users_have_are_served_without_a_complaint() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/kit/printers");
+    let mut count = 0;
+    for file in fs::read_dir(folder).unwrap() {
+        let path = file.unwrap().path();
+        if path.ends_with("voron-macros.cfg") {
+            continue;
+        }
+        let (status, _, log) = output(&["sim", path.to_str().unwrap(), "--print-board"]);
+        assert_eq!((status, log.as_str()), (Some(0), ""), "{}", path.display());
+        count += 1;
+    }
+    assert!(count >= 6, "{count}");
 }
 
 #[test]

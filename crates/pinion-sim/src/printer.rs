@@ -18,6 +18,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
+use pinion_firmware::time::Ticks;
 use pinion_linux::clock::Monotonic;
 use pinion_printer_config::Trouble;
 use pinion_runtime::wakeup::MarginLimits;
@@ -108,7 +109,8 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     let own = match args.file.as_deref().filter(|file| is_printer_cfg(file)) {
         Some(file) => match own::run::read(file, &args.own) {
             Ok(own) => Some(own),
-            Err(error) => return failed(error),
+            Err(mistake) if args.own.attempt => return attempt::refused(file, mistake, args.own.form()),
+            Err(mistake) => return failed(mistake),
         },
         None if args.own.is_used() => {
             return failed(
@@ -178,13 +180,16 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(path) => path,
         Err(error) => return failed(format!("the path cannot be recorded: {error}")),
     };
+    // Whoever waits for exact steps spins. A trial has time for a step that is 50 us late, and computers with two
+    // processors have no time for several MCUs that spin.
+    let is_tried = owner.as_ref().is_some_and(|owner| owner.attempt.is_some());
     let options = Options {
         link: LinkName::Pty(symlink.clone()),
         dialect: None,
         access: Access { mode: 0o660, group: None },
         realtime: args.realtime,
         cpu: None,
-        margin: MarginLimits::default(),
+        margin: if is_tried { MarginLimits::always(Ticks(0)) } else { MarginLimits::default() },
         watchdog: None,
         trace_edges: args.trace_edges,
         sockets,
@@ -291,6 +296,10 @@ fn serve(
     };
     let timing = board.timing();
     let ended = pinion_runtime::run(options, Box::new(board), timing, recording, helpers, ready);
+    // A trial that is interrupted ends with this process.
+    if let Some(attempt) = owner.as_ref().and_then(|owner| owner.attempt.as_ref()) {
+        attempt.running.end();
+    }
     if !right.load(Ordering::SeqCst) && ended.is_ok() {
         return ExitCode::FAILURE;
     }
@@ -311,10 +320,15 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
         log::error!("{error}");
         Arc::default()
     });
-    let (owner, probe, right, attempt) = (owner.clone(), probe.clone(), right.clone(), attempt.clone());
+    // Without a permission klippy runs as this program does, which has a warning in the log.
+    let realtime = args.realtime && realtime::is_permitted().is_ok();
+    let (owner, probe, right) = (owner.clone(), probe.clone(), right.clone());
+    let attempt = Attempt { realtime, ..attempt.clone() };
     let thread = thread::Builder::new().name("try".into()).spawn(move || {
-        // The link's thread starts it, and passes its real-time priority on.
-        realtime::leave();
+        if realtime {
+            // The link's thread starts it, and passes its real-time priority on.
+            realtime::leave();
+        }
         if let Place::Folder(folder) = &owner.place {
             let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, &ended);
             right.store(passed, Ordering::SeqCst);

@@ -253,4 +253,10 @@ pub const MISTAKES: &[Mistake] = &[
         "endstop_pin: probe:z_virtual_endstop",
         "Unknown pin chip name 'probe'",
     ),
+    early(
+        "sensor_type: Generic 3950\nsensor_pin: PA1\n",
+        "sensor_type: Bed\nsensor_pin: PA1\n[thermistor Bed]\ntemperature1: 25\nresistance1: 100000\nbeta: 3950\n[heater_bed]\n",
+        "sensor_type: Bed",
+        "Unknown temperature sensor 'Bed'",
+    ),
 ];

@@ -10,11 +10,17 @@ use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
+use nix::unistd::Pid;
 use serde_json::{Value, json};
 
+use super::Attempt;
+use super::stall::Stalls;
 use crate::own::serve::Folder;
 use pinion_printer_config::Trouble;
 
@@ -42,9 +48,25 @@ pub(super) enum Refused {
     Gone(String),
 }
 
+/// The number of the process that this program started, so that nothing of it stays when the program ends.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Running(Arc<AtomicI32>);
+
+impl Running {
+    /// Ends it, if it runs.
+    pub(crate) fn end(&self) {
+        // A process that nobody has waited for keeps its number.
+        let pid = self.0.swap(0, Ordering::SeqCst);
+        if pid != 0 {
+            let _ = nix::sys::signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
+        }
+    }
+}
+
 /// A klippy.
 pub(super) struct Host {
     child: Child,
+    running: Running,
     socket: PathBuf,
     api: UnixStream,
     buffer: Vec<u8>,
@@ -53,6 +75,8 @@ pub(super) struct Host {
     answers: HashMap<u64, Value>,
     /// klippy's output since the last command.
     pub(super) said: Vec<String>,
+    /// How long it and the MCUs waited for a processor.
+    pub(super) stalls: Stalls,
 }
 
 impl Host {
@@ -61,7 +85,8 @@ impl Host {
     /// # Errors
     ///
     /// It cannot be started, or opens no API.
-    pub(super) fn start(klipper: &Path, python: &Path, folder: &Folder, realtime: bool) -> Result<Host, Trouble> {
+    pub(super) fn start(attempt: &Attempt, folder: &Folder) -> Result<Host, Trouble> {
+        let Attempt { klipper, python, realtime, running, .. } = attempt;
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
         if !program.is_file() {
@@ -72,8 +97,8 @@ impl Host {
         let _ = std::fs::remove_file(&socket);
         let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
         // While it homes, klippy is a tenth of a second ahead of the MCU, and a busy computer makes it late.
-        let mut command = Command::new(if realtime { Path::new("chrt") } else { python });
-        if realtime {
+        let mut command = Command::new(if *realtime { Path::new("chrt") } else { python });
+        if *realtime {
             command.args(["-f", "1"]).arg(python);
         }
         command.arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
@@ -84,6 +109,8 @@ impl Host {
         let mut child = started.map_err(|error| {
             failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
         })?;
+        running.0.store(child.id().cast_signed(), Ordering::SeqCst);
+        let stalls = Stalls::watch(child.id());
         let until = Instant::now() + START;
         let api = loop {
             if let Ok(api) = UnixStream::connect(&socket) {
@@ -91,14 +118,16 @@ impl Host {
             }
             let ended = child.try_wait().ok().flatten();
             if ended.is_some() || Instant::now() > until {
+                running.0.store(0, Ordering::SeqCst);
                 let _ = child.kill();
                 let _ = child.wait();
                 return Err(no_start(&folder.path, ended.is_some()).of(program.display()));
             }
             thread::sleep(Duration::from_millis(50));
         };
-        let mut host =
-            Host { child, socket, api, buffer: Vec::new(), next_id: 0, answers: HashMap::new(), said: Vec::new() };
+        let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
+        let running = running.clone();
+        let mut host = Host { child, running, socket, api, buffer, next_id: 0, answers, said, stalls };
         let subscribed = host.subscribe();
         subscribed.map(|()| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
     }
@@ -223,6 +252,17 @@ impl Host {
         }
     }
 
+    /// Has klippy reset the MCUs and restart itself.
+    pub(super) fn firmware_restart(&mut self) {
+        let until = Instant::now() + ANSWER;
+        // The answer may come before the restart, or never.
+        let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
+        while self.state().is_ok() && Instant::now() < until {
+            thread::sleep(Duration::from_millis(50));
+        }
+        self.reconnect();
+    }
+
     /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
     pub(super) fn reconnect(&mut self) -> bool {
         let until = Instant::now() + START;
@@ -242,8 +282,7 @@ impl Host {
 
     /// Ends klippy. One that hangs is killed.
     pub(super) fn end(&mut self) {
-        let pid = nix::unistd::Pid::from_raw(self.child.id().cast_signed());
-        let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM);
+        self.running.end();
         let until = Instant::now() + END_TIME;
         while Instant::now() < until {
             if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {

@@ -10,10 +10,12 @@ mod host;
 mod place;
 mod report;
 mod small;
+mod stall;
 
 use std::fs;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
@@ -28,9 +30,11 @@ use serde_json::Value;
 use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
 use crate::own::{Kind, kind_of};
+pub(crate) use host::Running;
 use host::{Host, Refused};
 use place::place_of;
-use report::{Form, Outcome, Report};
+pub(crate) use report::Form;
+use report::{Outcome, Report};
 
 /// How long klippy has to be ready.
 const READY: Duration = Duration::from_secs(90);
@@ -74,15 +78,19 @@ const STARTS: [&str; 4] = ["START_PRINT", "PRINT_START", "START_GCODE", "BEGIN_P
 const ENDS: [&str; 3] = ["END_PRINT", "PRINT_END", "END_GCODE"];
 
 /// Words of a stop because a computer is too busy.
-const BUSY: [&str; 5] = [
+const BUSY: [&str; 6] = [
     "Timer too close",
     "Rescheduled timer in the past",
     "Missed scheduling of next",
     "Lost communication with MCU",
     "Communication timeout during homing",
+    "Timeout on wait for",
 ];
 /// How often a step is repeated because of them.
 const TRIES: u32 = 4;
+
+/// Shortest wait for a processor that klippy can stop for: while it homes with several MCUs, it has 25 ms.
+const STALL: Duration = Duration::from_millis(20);
 
 /// The options of `--try`.
 #[derive(Clone, Debug)]
@@ -93,9 +101,11 @@ pub(crate) struct Attempt {
     pub(crate) gcode: Option<PathBuf>,
     /// Only these steps, if there are any.
     pub(crate) only: Vec<String>,
-    pub(crate) json: bool,
+    pub(crate) form: Form,
     /// klippy gets real time, too.
     pub(crate) realtime: bool,
+    /// The klippy, while it runs.
+    pub(crate) running: Running,
 }
 
 /// Tries a printer. Returns whether nothing failed. `ended` is set when the program is asked to end.
@@ -106,15 +116,14 @@ pub(crate) fn run(
     probe: &SimProbe,
     ended: &AtomicBool,
 ) -> bool {
-    let form = if attempt.json { Form::Json } else { Form::Lines };
-    let mut report = Report::new(form);
+    let mut report = Report::new(attempt.form);
     let since = Instant::now();
     report.progress("klippy starts");
-    let host = match Host::start(&attempt.klipper, &attempt.python, folder, attempt.realtime) {
+    let host = match Host::start(attempt, folder) {
         Ok(host) => host,
         Err(trouble) => {
             report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, since);
-            report.end(printer, &folder.path);
+            report.end(printer, Some(&folder.path));
             return false;
         }
     };
@@ -132,7 +141,7 @@ pub(crate) fn run(
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
             None => trial.tried(step),
         };
-        if matches!(outcome, Outcome::Failed { .. }) {
+        if outcome.is_failure() {
             trial.recover(step.name);
         }
         report.add(step.name, outcome, since);
@@ -141,8 +150,27 @@ pub(crate) fn run(
         log::warn!("{trouble}");
     }
     drop(trial);
-    report.end(printer, &folder.path);
+    report.end(printer, Some(&folder.path));
     report.passed() && !ended.load(Ordering::SeqCst)
+}
+
+/// Reports a mistake that is found before klippy starts.
+pub(crate) fn refused(printer: &Path, mistake: Trouble, form: Form) -> ExitCode {
+    let mut report = Report::new(form);
+    let (cause, place) = without_place(mistake);
+    report.add("read", Outcome::Failed { cause, place }, Instant::now());
+    report.end(printer, None);
+    ExitCode::FAILURE
+}
+
+/// The text of a mistake, and its place, which is `file:line` in front of its subject.
+fn without_place(mistake: Trouble) -> (String, Option<Place>) {
+    let subject = mistake.subject.clone().unwrap_or_default();
+    let (first, rest) = subject.split_once(": ").unwrap_or((&subject, ""));
+    let place = first.rsplit_once(':').and_then(|(file, line)| Some((file, line.parse().ok()?)));
+    let Some((file, line)) = place else { return (mistake.to_string(), None) };
+    let subject = Some(rest).filter(|rest| !rest.is_empty()).map(Box::from);
+    (Trouble { subject, ..mistake }.to_string(), Some(Place { file: Path::new(file).into(), line }))
 }
 
 /// Something that is tried.
@@ -242,26 +270,29 @@ impl Trial<'_> {
         }
     }
 
-    /// Runs a step. It is repeated if the computer was too busy for it: that says nothing about the printer.
+    /// Runs a step. It is repeated if klippy stopped because it or an MCU was late. If this computer made them late each
+    /// time, the step says nothing about the printer.
     fn tried(&mut self, step: &Step) -> Outcome {
-        for _ in 0..TRIES {
+        let mut tries = TRIES;
+        loop {
+            self.host.stalls.take();
             let outcome = (step.run)(self);
+            let stall = self.host.stalls.take();
             let Outcome::Failed { cause, .. } = &outcome else { return outcome };
             if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
                 return outcome;
             }
-            if !self.begins_again(step.name) {
-                return outcome;
+            if tries == 0 || !self.begins_again(step.name) {
+                return if stall < STALL { outcome } else { Outcome::Slow { cause: cause.clone(), stall } };
             }
+            tries -= 1;
         }
-        (step.run)(self)
     }
 
     /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
     fn restart(&mut self) -> Result<(), Trouble> {
         self.host.end();
-        let Attempt { klipper, python, realtime, .. } = self.attempt;
-        self.host = Host::start(klipper, python, self.folder, *realtime)?;
+        self.host = Host::start(self.attempt, self.folder)?;
         Ok(())
     }
 
@@ -284,7 +315,9 @@ impl Trial<'_> {
 
     /// Starts another klippy, and homes unless a step does that itself. Returns whether this worked.
     fn begins_again(&mut self, step: &str) -> bool {
-        self.restart().is_ok() && self.until_ready().is_ok() && (is_first(step) || self.host.gcode("G28", LONG).is_ok())
+        self.restart().is_ok()
+            && self.until_ready_again().is_ok()
+            && (is_first(step) || self.host.gcode("G28", LONG).is_ok())
     }
 
     /// Waits until klippy is ready. The error is its words.
@@ -300,6 +333,17 @@ impl Trial<'_> {
                 Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
                 Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
             }
+        }
+    }
+
+    /// The same for another klippy. Some wait for the user if they find an MCU shut down.
+    fn until_ready_again(&mut self) -> Result<(), String> {
+        match self.until_ready() {
+            Err(words) if words.contains("is shutdown") => {
+                self.host.firmware_restart();
+                self.until_ready()
+            }
+            ready => ready,
         }
     }
 
@@ -611,8 +655,10 @@ impl Trial<'_> {
         }
         let before = self.lost();
         for (section, command, moves) in &found {
-            if let Err(outcome) = self.gcode("G28", LONG).and_then(|()| self.gcode(command, LONG)) {
-                return outcome.at(&section.place);
+            for script in ["G28", command, "M400"] {
+                if let Err(outcome) = self.gcode(script, LONG) {
+                    return outcome.at(&section.place);
+                }
             }
             if let Some((apart, name)) = self.apart().filter(|(apart, _)| *apart > LEVEL_MM && *moves == Moves::Motors)
             {
@@ -637,8 +683,8 @@ impl Trial<'_> {
             return Outcome::Skipped("there is no probe".into());
         }
         let before = self.lost();
-        let commands = ["G28", "PROBE_CALIBRATE", "ABORT"];
-        for command in commands {
+        // G28 may leave the probe where it has just triggered.
+        for command in ["G28", "G90\nG1 Z10 F600", "PROBE_CALIBRATE", "ABORT"] {
             if let Err(outcome) = self.gcode(command, LONG) {
                 return outcome;
             }

@@ -23,6 +23,11 @@ pub(super) enum Outcome {
         cause: String,
         place: Option<Place>,
     },
+    /// This computer made klippy or an MCU wait for so long that the step says nothing about the printer.
+    Slow {
+        cause: String,
+        stall: Duration,
+    },
     /// It was not tried, and why.
     Skipped(String),
 }
@@ -33,6 +38,25 @@ impl Outcome {
         match self {
             Outcome::Failed { cause, place: None } => Outcome::Failed { cause, place: Some(at.clone()) },
             other => other,
+        }
+    }
+
+    /// Whether nothing shows that the step works.
+    pub(super) fn is_failure(&self) -> bool {
+        matches!(self, Outcome::Failed { .. } | Outcome::Slow { .. })
+    }
+
+    /// The result's word, its text, and the place of a mistake.
+    fn parts(&self) -> (&'static str, String, Option<&Place>) {
+        match self {
+            Outcome::Passed(seen) => ("passed", seen.clone(), None),
+            Outcome::Skipped(why) => ("skipped", why.clone(), None),
+            Outcome::Failed { cause, place } => ("failed", cause.clone(), place.as_ref()),
+            Outcome::Slow { cause, stall } => {
+                let waited = format!("klippy or an MCU waited {:.2} s for a processor", stall.as_secs_f64());
+                let remedy = "end other programs, or add -r as root";
+                ("slow", format!("this computer is too slow: {waited}, and klippy says \"{cause}\": {remedy}"), None)
+            }
         }
     }
 }
@@ -46,7 +70,7 @@ struct Step {
 
 /// The form of the report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Form {
+pub(crate) enum Form {
     Lines,
     Json,
 }
@@ -76,13 +100,16 @@ impl Report {
         let took = since.elapsed();
         if self.form == Form::Lines {
             let mut page = Page::default();
-            let line = match &outcome {
-                Outcome::Passed(seen) => format!("ok    {name:<12} {seen} ({:.1} s)", took.as_secs_f64()),
-                Outcome::Skipped(why) => format!("-     {name:<12} {why}"),
-                Outcome::Failed { cause, place: Some(place) } => format!("FAIL  {name:<12} {place}: {cause}"),
-                Outcome::Failed { cause, place: None } => format!("FAIL  {name:<12} {cause}"),
+            let (result, text, place) = outcome.parts();
+            let mark = match result {
+                "passed" => "ok",
+                "skipped" => "-",
+                "slow" => "slow",
+                _ => "FAIL",
             };
-            page.line(line);
+            let place = place.map_or_else(String::new, |place| format!("{place}: "));
+            let seconds = if result == "passed" { format!(" ({:.1} s)", took.as_secs_f64()) } else { String::new() };
+            page.line(format_args!("{mark:<6}{name:<12} {place}{text}{seconds}"));
             self.erase();
             if let Err(error) = print(&page) {
                 log::warn!("{error}");
@@ -99,7 +126,7 @@ impl Report {
     }
 
     fn failed(&self) -> impl Iterator<Item = &Step> {
-        self.steps.iter().filter(|step| matches!(step.outcome, Outcome::Failed { .. }))
+        self.steps.iter().filter(|step| step.outcome.is_failure())
     }
 
     /// Whether nothing failed.
@@ -107,30 +134,44 @@ impl Report {
         self.failed().next().is_none()
     }
 
-    /// Writes the verdict, and a line for the CI.
-    pub(super) fn end(&self, printer: &Path, folder: &Path) {
+    /// Writes the verdict, and a line for the CI. The folder is missing if klippy was not started.
+    pub(super) fn end(&self, printer: &Path, folder: Option<&Path>) {
         let mut page = Page::default();
         match self.form {
             Form::Json => page = Page::json(&format!("{}\n", self.json(printer, folder))),
             Form::Lines => {
-                let failed: Vec<&str> = self.failed().map(|step| step.name).collect();
+                let names = |slow: bool| -> Vec<&str> {
+                    let of_kind = |step: &&Step| matches!(step.outcome, Outcome::Slow { .. }) == slow;
+                    self.failed().filter(of_kind).map(|step| step.name).collect()
+                };
+                let (failed, slow) = (names(false), names(true));
                 let name = printer.display();
-                match failed[..] {
-                    [] => page.line(format_args!("{name} works here: everything that was tried passed")),
-                    _ => page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", "))),
+                match (&failed[..], &slow[..]) {
+                    ([], []) => page.line(format_args!("{name} works here: everything that was tried passed")),
+                    ([], slow) => {
+                        let steps = slow.join(", ");
+                        page.line(format_args!(
+                            "{name} was not tried to the end: this computer is too slow for {steps}"
+                        ));
+                    }
+                    (failed, _) => {
+                        page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", ")));
+                    }
                 }
-                page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));
+                if let Some(folder) = folder {
+                    page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));
+                }
             }
         }
         // GitHub shows such a line at its place in the file.
         if std::env::var_os("GITHUB_ACTIONS").is_some() && self.form == Form::Lines {
             for step in self.failed() {
-                let Outcome::Failed { cause, place } = &step.outcome else { continue };
-                let at = place.as_ref().map_or_else(
+                let (_, text, place) = step.outcome.parts();
+                let at = place.map_or_else(
                     || format!("file={}", printer.display()),
                     |place| format!("file={},line={}", place.file.display(), place.line),
                 );
-                page.line(format_args!("::error {at},title={}::{cause}", step.name));
+                page.line(format_args!("::error {at},title={}::{text}", step.name));
             }
         }
         if let Err(error) = print(&page) {
@@ -138,13 +179,9 @@ impl Report {
         }
     }
 
-    fn json(&self, printer: &Path, folder: &Path) -> Value {
+    fn json(&self, printer: &Path, folder: Option<&Path>) -> Value {
         let steps = self.steps.iter().map(|step| {
-            let (result, text, place) = match &step.outcome {
-                Outcome::Passed(seen) => ("passed", seen, None),
-                Outcome::Skipped(why) => ("skipped", why, None),
-                Outcome::Failed { cause, place } => ("failed", cause, place.as_ref()),
-            };
+            let (result, text, place) = step.outcome.parts();
             json!({
                 "step": step.name,
                 "result": result,
@@ -157,7 +194,7 @@ impl Report {
         json!({
             "printer": printer.display().to_string(),
             "passed": self.passed(),
-            "folder": folder.display().to_string(),
+            "folder": folder.map(|folder| folder.display().to_string()),
             "steps": steps.collect::<Vec<Value>>(),
         })
     }

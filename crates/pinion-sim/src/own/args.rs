@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::Pace;
-use crate::attempt::{self, Attempt};
+use crate::attempt::{self, Attempt, Form, Running};
 use pinion_printer_config::Trouble;
 
 /// Options for a printer.cfg.
@@ -61,6 +61,11 @@ impl OwnArgs {
         if self.real_heat { Pace::Real } else { Pace::Fast }
     }
 
+    /// The form of the report of `--try`.
+    pub(crate) fn form(&self) -> Form {
+        if self.json { Form::Json } else { Form::Lines }
+    }
+
     /// The klippy that is named, for the command that a user copies.
     pub(crate) fn klipper(&self) -> Option<&Path> {
         self.klipper.as_deref()
@@ -82,8 +87,9 @@ impl OwnArgs {
             python,
             gcode: self.gcode.clone(),
             only: self.only.clone(),
-            json: self.json,
+            form: self.form(),
             realtime,
+            running: Running::default(),
         }))
     }
 }

@@ -135,6 +135,11 @@ impl Translator<'_> {
             }
             "DS18B20" => {
                 let serial = section.required("serial_no")?;
+                let digits = serial.strip_prefix("28-").unwrap_or_default();
+                if digits.len() != 12 || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
+                    let cause = format!("has serial_no {serial}, and the kernel gives a DS18B20 no such name");
+                    self.note(section, &cause, "name one in /sys/bus/w1/devices, such as 28-0123456789ab");
+                }
                 let name = self.out.name("part", heater);
                 self.out.add("part", part.set("kind", "ds18b20").set("name", name).set("serial", serial));
             }

@@ -14,8 +14,8 @@ use super::translate::Translator;
 const BEFORE_ENDSTOP_MM: f64 = 15.0;
 /// How high the nozzle begins over the bed.
 const START_HEIGHT_MM: f64 = 8.0;
-/// How far motors of one z axis are apart at first, if klippy can level them. The corners of a rectangle are in a plane.
-const TILT_MM: [f64; 4] = [0.0, 0.4, 0.1, -0.3];
+/// How far motors of one z axis are apart at first, if klippy can level them: along x and along y. They are in a plane.
+const TILT_MM: [f64; 2] = [-0.3, 0.4];
 /// A motor without an end of its own.
 const FREE_MM: f64 = 1000.0;
 
@@ -220,6 +220,7 @@ impl<'a> Translator<'a> {
         let others: Vec<&Section> =
             (1..100).map_while(|n| self.config.section(&format!("stepper_{axis}{n}"))).collect();
         let places = if axis == "z" { self.z_places(1 + others.len())? } else { None };
+        let tilts_mm = places.as_deref().map(tilts_mm).unwrap_or_default();
         let place = |entry: Entry, n: usize| match places.as_ref().and_then(|places| places.get(n)) {
             Some([x, y]) => entry.numbers("at_mm", [*x, *y]),
             None => entry,
@@ -231,8 +232,8 @@ impl<'a> Translator<'a> {
                 Some(_) => self.endstop(section)?,
                 None => Endstop::Other,
             };
-            let tilt = if places.is_some() { TILT_MM[n % TILT_MM.len()] } else { 0.0 };
-            self.out.add("axis", place(Translator::with_rail(entry, &rail, &endstop, start + tilt), n));
+            let start = start + tilts_mm.get(n).copied().unwrap_or_default();
+            self.out.add("axis", place(Translator::with_rail(entry, &rail, &endstop, start), n));
         }
         Ok(())
     }
@@ -462,4 +463,14 @@ impl<'a> Translator<'a> {
         }
         Ok(())
     }
+}
+
+/// How much higher each motor of a z axis begins than the first one. They hold a plane, which klippy can level.
+fn tilts_mm(places: &[[f64; 2]]) -> Vec<f64> {
+    let along = |axis: usize| {
+        let mms = || places.iter().map(move |place| place[axis]);
+        let span = mms().fold(f64::MIN, f64::max) - mms().fold(f64::MAX, f64::min);
+        mms().map(move |mm| if span > 0.0 { TILT_MM[axis] * (mm - places[0][axis]) / span } else { 0.0 })
+    };
+    along(0).zip(along(1)).map(|(x, y)| x + y).collect()
 }

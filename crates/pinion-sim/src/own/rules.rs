@@ -245,6 +245,18 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
     let has = |name: &str| config.section(name).is_some();
     let kinematics = config.section("printer").and_then(|printer| printer.text("kinematics"));
     match section.kind() {
+        "printer" if kinematics == Some("generic_cartesian") => {
+            for axis in ["x", "y", "z"] {
+                let along = |carriage: &&Section| carriage.text("axis").or(carriage.own_name()) == Some(axis);
+                let found: Vec<&str> = config.of_kind("carriage").filter(along).filter_map(Section::own_name).collect();
+                let cause = match found[..] {
+                    [] => format!("No carriage defined for axis '{axis}'"),
+                    [_] => continue,
+                    _ => format!("Axis '{axis}' is set for multiple primary carriages ({})", found.join(", ")),
+                };
+                return refused("kinematics", cause, "give each of x, y and z one [carriage]");
+            }
+        }
         "mcu" if section.text("canbus_uuid").is_none() => {
             section.required("serial")?;
         }
@@ -304,6 +316,15 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
             return refused("screw1", cause.into(), "add screw1 to screw3");
         }
         _ => {}
+    }
+    // klippy reads the sections in their order, and extruders after all others.
+    if let Some(sensor) = section.text("sensor_type").filter(|_| !section.kind().starts_with("extruder")) {
+        let own = ["thermistor", "adc_temperature"].map(|kind| format!("{kind} {sensor}"));
+        let mut later = config.sections().iter().skip_while(|other| other.name != section.name);
+        if let Some(own) = later.find(|other| own.contains(&other.name)) {
+            let cause = format!("Unknown temperature sensor '{sensor}'");
+            return refused("sensor_type", cause, &format!("move [{}] above this section", own.name));
+        }
     }
     if let Some(nozzle) = section.number("nozzle_diameter", Limit::Any)? {
         section.number("filament_diameter", Limit::Min(nozzle))?;

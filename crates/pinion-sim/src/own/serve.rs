@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use pinion_linux::foreign::{self, word};
 use pinion_printer_config::copy::{self, Change};
 use pinion_printer_config::pins::MAIN;
-use pinion_printer_config::{Config, Trouble};
+use pinion_printer_config::{Config, Section, Trouble};
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
@@ -20,6 +20,8 @@ use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
 const WAYS: [&str; 5] = ["serial", "canbus_uuid", "canbus_interface", "baud", "restart_method"];
+/// The temperature of the printer's computer, as the kernel writes it.
+const HOST_TEMPERATURE: &str = "45000\n";
 /// Longest file of saved variables.
 const VARIABLES_MAX: u64 = 1 << 20;
 
@@ -177,6 +179,14 @@ impl Folder {
             with: vec![(key.into(), value.display().to_string())],
         };
         changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        let is_of_host = |section: &&Section| section.text("sensor_type") == Some("temperature_host");
+        let of_host: Vec<&Section> = own.config.sections().iter().filter(is_of_host).collect();
+        if !of_host.is_empty() {
+            // This computer may have no thermometer, and has another temperature than the printer's one.
+            let millidegrees = path.join("host_temperature");
+            fs::write(&millidegrees, HOST_TEMPERATURE).map_err(|error| failed(&millidegrees, error))?;
+            changes.extend(of_host.iter().map(|section| elsewhere(&section.name, "sensor_path", &millidegrees)));
+        }
         if let Some(section) = own.config.section("save_variables") {
             let variables = path.join("variables.cfg");
             let file = section.text("filename").map(at_home);

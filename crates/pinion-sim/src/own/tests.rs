@@ -78,3 +78,28 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     let note = notes[0].to_string();
     assert!(note.ends_with(&format!("printer.cfg:{line}: [beacon] {words}")), "{note}");
 }
+
+#[test]
+fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
+    let start = |text: &str| -> Vec<f64> {
+        let Translated { description, .. } = translated(text).unwrap();
+        let names = ["z", "z1", "z2", "z3"].into_iter();
+        names.map(|name| named(&description, "axis", "name", name)["start_mm"].as_float().unwrap()).collect()
+    };
+    let more: String = (2..4)
+        .map(|n| format!("[stepper_z{n}]\nstep_pin: PE{n}\ndir_pin: PF{n}\nmicrosteps: 16\nrotation_distance: 8\n"))
+        .collect();
+    // Not in klippy's order of the corners for [quad_gantry_level].
+    let corners = "z_positions: 0,0\n  200,0\n  0,300\n  200,300\n";
+    let text = PRINTER.replace("z_positions: -20,110\n  250,110\n", corners);
+    let [z, z1, z2, z3] = start(&format!("{text}{more}"))[..] else { unreachable!() };
+    assert!((z1 - z - -0.3).abs() < 1e-9 && (z2 - z - 0.4).abs() < 1e-9 && (z3 - z - 0.1).abs() < 1e-9);
+}
+
+#[test]
+fn a_chip_without_a_select_pin_is_on_the_bus_of_its_mcu() {
+    let text = format!("{PRINTER}[adxl345]\ncs_pin: tool:None\nspi_bus: spidev2.0\n");
+    let Translated { description, .. } = translated(&text).unwrap();
+    let chip = named(&description, "part", "kind", "adxl345");
+    assert_eq!((chip["bus"].as_str(), chip.get("select_pin")), (Some("tool:spidev2.0"), None));
+}

@@ -175,8 +175,9 @@ impl Translator<'_> {
     /// The SPI bus of a chip, and its select pin.
     pub(super) fn spi(&mut self, section: &Section, key: &str) -> Result<Option<(String, Option<String>)>, Trouble> {
         let select = self.pin(section, key)?;
-        let select = select.filter(|pin| pin.name != "None");
+        // `rpi:None` names the MCU of a chip that is alone on its bus.
         let mcu = select.as_ref().map_or(MAIN.to_owned(), |pin| pin.chip.clone());
+        let select = select.filter(|pin| pin.name != "None");
         if select.as_ref().is_some_and(|pin| !self.is_real(pin)) {
             return Ok(None);
         }

@@ -44,9 +44,8 @@ impl Part for Ds18b20Config {
     }
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
-        let digits = self.serial.strip_prefix("28-").unwrap_or_default();
-        if digits.len() != 12 || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
-            let cause = format!("`{}` is no serial number", self.serial);
+        if self.serial.is_empty() || !self.serial.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)) {
+            let cause = format!("`{}` is no name of a device", self.serial);
             return wrong(whose, "serial", &cause, "give `28-` and twelve hexadecimal digits");
         }
         check(whose, "conversion_ms", self.conversion_ms as f64, Bound::NotNegative)?;
