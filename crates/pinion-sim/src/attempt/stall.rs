@@ -105,7 +105,7 @@ mod tests {
         thread("7", "core", "900 1000 1");
         thread("8", "board tool", "900 1000 1");
         thread("9", "recorder", "900 1000 1");
-        assert_eq!(accounts.longest_wait(folder.path(), OURS), Some(Duration::ZERO), "since when");
+        assert_eq!(accounts.longest_wait(folder.path(), ALL), Some(Duration::ZERO), "since when");
         thread("7", "core", "950 31000 1");
         thread("8", "board tool", "950 1500 1");
         thread("9", "recorder", "950 91000 1");
