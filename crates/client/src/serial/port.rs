@@ -20,7 +20,7 @@ use pinion_protocol::block::{Found, Resync, Sequence, frame};
 use crate::Error;
 
 /// Carries bytes over a tty, pty, socket or any other pollable file. Finds the blocks in the input, in any order. Tests
-/// send bytes through it that a [`BlockLink`] would never send.
+/// send bytes through it that a [`BlockLink`](super::BlockLink) would never send.
 #[derive(Debug)]
 pub struct Port {
     file: File,

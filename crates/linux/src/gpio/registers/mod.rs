@@ -7,7 +7,7 @@
 //!
 //! The RP1 of a Raspberry Pi 5 is behind PCIe, which takes a store and delivers it later. If the link sleeps, that may be
 //! microseconds later, and several stores come together (raspberrypi/linux pull request 6279). So its registers are used
-//! only if the kernel never lets the link sleep, and each edge with a time is read back ([`RegisterBank::flush`]).
+//! only if the kernel never lets the link sleep, and each edge with a time is read back ([`LineRegisters::flush`]).
 //!
 //! The device tree names the chip. A chip that is not listed here has no registers.
 
