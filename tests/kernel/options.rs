@@ -32,6 +32,9 @@ pub struct Options {
     pub shell: bool,
 }
 
+/// Figures that search for a rate. They take minutes, so they run only if a filter asks for them, such as `figures`.
+const SEARCHES: &str = "figures::most_steps";
+
 impl Options {
     /// Exits after an error, and for `--help`.
     pub fn from_args() -> Options {
@@ -51,6 +54,8 @@ impl Options {
 
     /// Whether the test runs on this flavor. The name is the test's name in the report.
     pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
-        self.flavour.is_none_or(|only| only == flavour) && self.arguments.selects(name)
+        self.flavour.is_none_or(|only| only == flavour)
+            && self.arguments.selects(name)
+            && (!name.contains(SEARCHES) || self.arguments.has_filter())
     }
 }

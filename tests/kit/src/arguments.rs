@@ -73,6 +73,12 @@ impl Arguments {
             && (self.filters.is_empty() || self.filters.iter().any(matches))
             && !self.skips.iter().any(matches)
     }
+
+    /// Whether the command line names tests.
+    pub fn has_filter(&self) -> bool {
+        !self.filters.is_empty()
+    }
+
     /// The selection, for another program with libtest.
     pub fn for_libtest(&self) -> Vec<&str> {
         let skips = self.skips.iter().flat_map(|skip| ["--skip", skip]);
