@@ -683,8 +683,12 @@ impl Trial<'_> {
             return Outcome::Skipped("there is no probe".into());
         }
         let before = self.lost();
-        // G28 may leave the probe where it has just triggered.
-        for command in ["G28", "G90\nG1 Z10 F600", "PROBE_CALIBRATE", "ABORT"] {
+        // G28 may end where the probe has triggered, or where it is beside the bed.
+        let Ok(status) = self.host.query(&["toolhead"]) else { return self.failed("klippy does not answer", None) };
+        let [low, high] = ["axis_minimum", "axis_maximum"].map(|key| coordinates(&status["toolhead"][key]));
+        let [x, y] = [0, 1].map(|n| (low[n] + high[n]) / 2.0);
+        let middle = format!("G90\nG1 Z10 F600\nG1 X{x:.2} Y{y:.2} F6000");
+        for command in ["G28", &middle, "PROBE_CALIBRATE", "ABORT"] {
             if let Err(outcome) = self.gcode(command, LONG) {
                 return outcome;
             }
