@@ -459,7 +459,7 @@ mod tests {
         let format = "config_endstop oid=%c pin=%c pull_up=%c";
         assert_eq!(wrong("config_endstop oid=1"), format!("parameter `pin` is missing (it is {format})"));
         let pin = wrong("config_endstop oid=1 pin=GPIO18 pull_up=1");
-        assert!(pin.contains("`GPIO18` is none of the names that pin takes; did you mean GPIO17?"), "{pin}");
+        assert!(pin.contains("`GPIO18` is not a value of pin; did you mean GPIO17?"), "{pin}");
         assert!(wrong("config_endstop oid=1 pim=GPIO17 pull_up=1").contains("did you mean pin?"));
         assert!(wrong("delay").starts_with("delay SECONDS") && wrong("delay soon").contains("such as 0.5"));
         drop(console);
