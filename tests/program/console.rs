@@ -76,7 +76,7 @@ fn a_script_ends_at_its_first_error_and_tells_the_line() {
     let (_folder, file) = folder_with("script", "get_uptime\nconfig_endstop oid=0 pin=x_endstp pull_up=1\n");
     let output = console(&["--board", "sim", "-f", file.to_str().unwrap()], "");
     let log = text(&output.stderr);
-    assert!(log.contains(&format!("{}: line 2: `x_endstp` is none", file.display())), "{log}");
+    assert!(log.contains(&format!("{}: line 2: `x_endstp` is not a value of pin", file.display())), "{log}");
     assert!(log.contains("did you mean x_endstop?"), "{log}");
     assert_eq!(output.status.code(), Some(1));
 }
