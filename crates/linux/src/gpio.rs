@@ -180,7 +180,7 @@ impl HeldLine {
     ///
     /// # Errors
     ///
-    /// The difference between what they and the kernel say about the line. It stays as it is.
+    /// The registers and the kernel differ about the line. The line stays as it is.
     fn trust(
         &mut self,
         registers: LineRegisters,

@@ -95,7 +95,7 @@ impl OwnFolder {
         below(&self.0).join(name)
     }
 
-    /// Makes a file for writing. What an earlier program has left under this name is removed.
+    /// Makes a file for writing. A file that an earlier program has left under this name is removed.
     ///
     /// # Errors
     ///

@@ -33,7 +33,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// The node for a bus number on the wire. The numbers are those of the C program.
+    /// The node for a bus number on the wire. Klipper's C has the same numbers.
     pub fn of(number: u32) -> Node {
         Node { bus: number >> 8, select: number & 0xff }
     }

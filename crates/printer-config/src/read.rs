@@ -116,7 +116,7 @@ impl Reader<'_> {
         Ok(text.replace("\r\n", "\n").replace('\r', "\n"))
     }
 
-    /// Reads a text and what it includes.
+    /// Reads a text and the files that it includes.
     fn include(&mut self, file: &Arc<Path>, text: &str) -> Result<(), Trouble> {
         let whole = self.files.whole(file);
         if self.within.contains(&whole) {

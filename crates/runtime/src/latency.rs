@@ -204,7 +204,7 @@ const STEPPERS_P999_US: f64 = 100.0;
 const STEPPERS_MAX_US: f64 = 1000.0;
 const SLOW_MAX_US: f64 = 50_000.0;
 
-/// Says what the measurements of both halves allow.
+/// The uses that the measurements of both halves allow.
 pub fn judge(halves: &[Half], scheduling: Scheduling) -> Assessment {
     let worst = |q: fn(&Lateness) -> Ticks| halves.iter().map(|half| us(q(&half.edge))).fold(0.0, f64::max);
     let p999 = worst(|lateness| lateness.quantile(0.999));

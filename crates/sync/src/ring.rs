@@ -91,7 +91,7 @@ impl<'a> Ring<'a> {
         self.place(number).each_ref().map(|word| word.load(Ordering::Relaxed))
     }
 
-    /// The oldest record of which all copies made so far are whole.
+    /// The oldest record whose copies so far are all whole.
     fn oldest_whole(self) -> u64 {
         // Pairs with the fence of the writer: a reader that saw a word of record N sees a count of N or above.
         fence(Ordering::Acquire);

@@ -191,7 +191,7 @@ impl Rig {
         self.clock.set(end);
     }
 
-    /// Lets the MCU run what is due, for at most this many turns. A command may ask for events without end.
+    /// Lets the MCU run its due timers and jobs, for at most this many turns. A command may ask for events without end.
     pub fn run_turns(&mut self, turns: u32) {
         for _ in 0..turns {
             if let Some(next) = self.turn() {
@@ -200,7 +200,7 @@ impl Rig {
         }
     }
 
-    /// Runs what is due, and returns the time of the next event.
+    /// Runs the due timers and jobs, and returns the time of the next event.
     #[inline]
     pub fn turn(&mut self) -> Option<Clock> {
         self.mcu.run_timers();

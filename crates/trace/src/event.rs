@@ -75,7 +75,7 @@ pub enum Event {
     HostCame,
     /// The last host closed the terminal. On a wire: it was silent for too long, or the port was gone.
     HostGone,
-    /// The link refused what came from the host.
+    /// The link refused bytes from the host.
     Refused(Refusal),
     /// The link refused a block, and asked the host to send again from a sequence number on.
     Nak,
@@ -113,7 +113,7 @@ pub enum Event {
         /// How long it waited for a processor.
         waited: Ticks,
     },
-    /// The recorder has looked at the kernel's accounts. It comes behind the events of what it saw.
+    /// The recorder has looked at the kernel's accounts. It comes behind the events of its findings.
     Looked {
         /// The next sample comes within this time.
         again: Ticks,

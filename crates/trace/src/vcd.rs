@@ -15,7 +15,7 @@ use super::history::{Deed, History, short};
 /// The signals begin this long before the end of the recording, or with it. PulseView makes a sample of each unit of
 /// time, even if nothing changes.
 const SPAN: i64 = Ticks::from_ms(10_000).0 as i64;
-/// Longest part after the end of the recording. What a stop does takes some ms.
+/// Longest part after the end of the recording. A stop takes some ms.
 const AFTER_MAX: i64 = Ticks::from_ms(1_000).0 as i64;
 /// Ticks in a unit of time.
 const UNIT: i64 = Ticks::from_us(1).0 as i64;
@@ -24,7 +24,7 @@ const UNIT_OF_EDGES: i64 = UNIT / 10;
 /// Highest number of outputs.
 const OUTPUTS_MAX: usize = 64;
 
-/// Writes the signals of the last ten seconds, and of what a stop did.
+/// Writes the signals of the last ten seconds and of the stop.
 ///
 /// - `core_awake`: the core does not sleep
 /// - `core_held`: commands wait for a bus

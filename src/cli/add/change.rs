@@ -221,7 +221,7 @@ impl Side<'_> {
     ///
     /// # Errors
     ///
-    /// One line with the file and the cause. What was made until then is recorded.
+    /// One line with the file and the cause. The changes made until then are recorded.
     pub(super) fn make(&self, device: &str, new: &Record) -> Result<(), String> {
         for file in files(&new.changes) {
             self.refuse_read_only(&file)?;
@@ -257,7 +257,7 @@ impl Side<'_> {
     ///
     /// # Errors
     ///
-    /// One line with the file and the cause. What is left can be taken back by another call.
+    /// One line with the file and the cause. Another call takes the others back.
     pub(super) fn undo(&self, device: &str, devices: &[&str]) -> Result<Vec<String>, String> {
         let mut left = Vec::new();
         let Some(record) = self.record(device)? else { return Ok(left) };
@@ -311,7 +311,7 @@ impl Side<'_> {
         Ok(())
     }
 
-    /// Removes a device's copy of a file, if what the device has changed there was found and taken back.
+    /// Removes a device's copy of a file, if the device's changes there were found and taken back.
     fn drop_copy(&self, file: &Path, device: &str, is_clean: bool, left: &mut Vec<String>) -> Result<(), String> {
         let copy = copy_of(file, device);
         if self.read(&copy)?.is_none() {

@@ -107,7 +107,7 @@ fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, Stri
     }
 }
 
-/// The acceleration in klippy's answer to ACCELEROMETER_QUERY, judged: at rest it is that of gravity.
+/// The acceleration in klippy's answer to ACCELEROMETER_QUERY, judged: at rest it is gravity's.
 fn acceleration(line: &str) -> Option<Result<String, String>> {
     const GRAVITY_MM_S2: f64 = 9806.65;
     let values = line.split_once("accelerometer values (x, y, z): ")?.1;

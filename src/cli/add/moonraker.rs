@@ -85,7 +85,7 @@ impl Moonraker<'_> {
             let info = self.ask("GET", "/printer/info");
             let state = info.as_ref().map_or("", |info| info["result"]["state"].as_str().unwrap_or_default());
             was_away |= !["ready", "error", "shutdown"].contains(&state);
-            // At first the answer may still be that of before.
+            // The first answers may still be from before the restart.
             let is_new = was_away || asked.elapsed() >= LEAVE_TIMEOUT;
             match state {
                 "ready" if is_new => return Ok(()),
@@ -172,7 +172,7 @@ impl Moonraker<'_> {
     }
 }
 
-/// Why Moonraker has not done what it was asked for.
+/// Why Moonraker has not done it.
 struct Refused {
     /// The HTTP status, if it has answered.
     status: Option<u16>,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! printer.cfg: what is in it, and what a device adds.
+//! printer.cfg: its sections, and the ones that a device adds.
 //!
 //! A device has a file of its own in the folder `pinion` beside printer.cfg, and all of them share one
 //! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched.
@@ -71,7 +71,7 @@ impl Files for Readable<'_> {
     }
 }
 
-/// Finds printer.cfg: the one that is named, that of the only klippy, or the only one in a home folder.
+/// Finds printer.cfg: the named one, the one of the only klippy, or the only one in a home folder.
 ///
 /// # Errors
 ///

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Asks a device over its bus whether it is there, and reads what a wrong answer means.
+//! Asks a device over its bus whether it is there, and explains a wrong answer.
 
 #![forbid(unsafe_code)]
 
@@ -81,7 +81,7 @@ impl Buses for Live {
 ///
 /// # Errors
 ///
-/// One line: what it has answered, what that means, and what to do.
+/// One line: the answer, its meaning and the remedy.
 pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result<Answer, String> {
     let Some(check) = &way.check else {
         return Ok(Answer { text: "it cannot be asked: try it out".into(), address: None });

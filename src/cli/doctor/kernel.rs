@@ -74,7 +74,10 @@ fn throttle(computer: &Computer) -> Finding {
     let number =
         |name: &str| -> Option<i64> { computer.text(format!("/proc/sys/kernel/sched_rt_{name}_us"))?.parse().ok() };
     let (Some(runtime), Some(period)) = (number("runtime"), number("period")) else {
-        return Finding::ok(CHECK, "the kernel does not say if it throttles real time");
+        return Finding::ok(
+            CHECK,
+            "whether the kernel throttles real time is unknown: there is no kernel.sched_rt_runtime_us",
+        );
     };
     let found = format!("real time may take {runtime} of {period} us");
     match runtime {
@@ -88,7 +91,10 @@ fn throttle(computer: &Computer) -> Finding {
 fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "isolated_cpus";
     let Some(isolated) = computer.text("/sys/devices/system/cpu/isolated") else {
-        return vec![Finding::ok(CHECK, "the kernel does not say which processors are isolated")];
+        return vec![Finding::ok(
+            CHECK,
+            "which processors are isolated is unknown: there is no /sys/devices/system/cpu/isolated",
+        )];
     };
     // If it is unknown, any processor may be there.
     let present = computer.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
@@ -275,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_kernel_does_not_tell_is_unknown() {
+    fn facts_that_the_kernel_does_not_give_are_unknown() {
         let findings = found(&Tree::new(), None);
         assert_eq!(findings.len(), 4);
         for finding in findings {

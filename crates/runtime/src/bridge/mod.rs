@@ -115,13 +115,13 @@ impl Wire {
         if self.outward.is_empty() { PollFlags::empty() } else { PollFlags::POLLOUT }
     }
 
-    /// Reads what the other end has sent into `flow`, and returns these bytes.
+    /// Reads the other end's bytes into `flow`, and returns them.
     fn read<'a>(&mut self, flow: &'a mut Flow) -> io::Result<(Incoming, &'a mut [u8])> {
         self.heard_at = monotonic();
         flow.fill(|buffer| read_some(&self.input, buffer))
     }
 
-    /// Writes what the pipe has room for.
+    /// Writes as many bytes as the pipe has room for.
     fn write(&mut self) -> io::Result<()> {
         if !self.outward.is_empty() {
             self.said_at = monotonic();

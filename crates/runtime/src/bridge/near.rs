@@ -105,7 +105,7 @@ struct Near {
 }
 
 impl Near {
-    /// Does what is due.
+    /// Does the work that is due.
     fn work(&mut self) -> Result<(), Trouble> {
         let now = monotonic();
         let is_lost = match &mut self.state {
@@ -272,7 +272,7 @@ impl Near {
         }
     }
 
-    /// Reads what the far end has sent.
+    /// Reads the far end's bytes.
     fn hear_far_end(&mut self) -> Result<(), Trouble> {
         let (State::Connecting { ssh, .. } | State::Up { ssh }) = &mut self.state else { return Ok(()) };
         let Some(wire) = ssh.wire() else { return Ok(()) };

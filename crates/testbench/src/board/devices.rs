@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Devices on buses: what a worker calls.
+//! Devices on buses: a worker calls them.
 
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What happens in a trial, as bytes choose it.
+//! The actions of a trial, chosen by bytes.
 
 #![forbid(unsafe_code)]
 

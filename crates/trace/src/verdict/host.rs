@@ -155,7 +155,7 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Judgmen
     with_power(record, (before, 0), Judgment::new(Culprit::Host, what, "look at its log, and at its load"))
 }
 
-/// How often the host sent again what it had sent, as a clause behind others.
+/// How often the host sent blocks again, as a clause behind others.
 fn resent(record: &Record, span: Span) -> String {
     match record.signs_of_host(span).0 {
         0 => String::new(),

@@ -2,8 +2,8 @@
 //! The registers of a Raspberry Pi's GPIO chip. A store to them is an edge in some 20 ns. An ioctl takes 1 to 2 us.
 //!
 //! A line is still claimed through the character device, and only the kernel changes its direction. Registers write and
-//! read the level of a claimed line. They are used after a check ([`LineRegisters::check`]): what they say about the
-//! line must be what the kernel says.
+//! read the level of a claimed line. They are used after a check ([`LineRegisters::check`]): the registers and
+//! the kernel must agree about the line.
 //!
 //! The RP1 of a Raspberry Pi 5 is behind PCIe, which takes a store and delivers it later. If the link sleeps, that may be
 //! microseconds later, and several stores come together (raspberrypi/linux pull request 6279). So its registers are used

@@ -74,7 +74,7 @@ fn say(socket: &OwnedFd, message: &impl Serialize) -> bool {
     send(socket.as_raw_fd(), &message, MsgFlags::MSG_NOSIGNAL).is_ok()
 }
 
-/// Leaves the new process only what it needs to read and to answer.
+/// Leaves the new process only the rights and files that it needs to read and to answer.
 ///
 /// # Errors
 ///

@@ -117,13 +117,13 @@ struct Bench {
     device: std::path::PathBuf,
     /// The host's end, while a host is there.
     host: Option<File>,
-    /// Finds the blocks in what the host reads.
+    /// Finds the blocks in the host's input.
     resync: Resync,
     heard: Vec<u8>,
     heard_bytes: usize,
     /// The last number that the host heard.
     last: Sequence,
-    /// An MCU that takes in what the hosts wrote.
+    /// An MCU that takes in the hosts' bytes.
     model: Receiver,
     written: Vec<u8>,
     /// The blocks that the model took.

@@ -397,7 +397,7 @@ impl Transport for CanBus {
                 }
                 Err(error) if is_full(&error) => break,
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                // A read reports that the interface is down or gone. The host asks again for what is lost.
+                // A read reports that the interface is down or gone. The host asks again for lost answers.
                 Err(_) => return Ok(bytes.len()),
             }
         }

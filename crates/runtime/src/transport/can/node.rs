@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use pinion_firmware::mcu::{CANBUS_UUID_BYTES, CanNode};
 
-/// The CAN id of what a host says to all nodes.
+/// The CAN id of a host's messages to all nodes.
 pub(super) const ADMIN_ID: u16 = 0x3f0;
 /// The CAN id of the answers.
 pub(super) const ADMIN_ANSWER_ID: u16 = 0x3f1;
