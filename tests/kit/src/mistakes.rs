@@ -259,4 +259,10 @@ pub const MISTAKES: &[Mistake] = &[
         "sensor_type: Bed",
         "Unknown temperature sensor 'Bed'",
     ),
+    early(
+        "step_pin: tool:gpio3",
+        "step_pin: PD2",
+        "step_pin: PD2",
+        "Multi-mcu homing not supported on multi-mcu shared axis",
+    ),
 ];

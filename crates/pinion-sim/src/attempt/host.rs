@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use nix::sys::signal::Signal;
+use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
@@ -58,7 +58,7 @@ impl Running {
         // A process that nobody has waited for keeps its number.
         let pid = self.0.swap(0, Ordering::SeqCst);
         if pid != 0 {
-            let _ = nix::sys::signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
+            let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
         }
     }
 }
@@ -282,7 +282,13 @@ impl Host {
 
     /// Ends klippy. One that hangs is killed.
     pub(super) fn end(&mut self) {
-        self.running.end();
+        let pid = self.child.id().cast_signed();
+        // Another klippy may run already.
+        let _ = self.running.0.compare_exchange(pid, 0, Ordering::SeqCst, Ordering::SeqCst);
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            return;
+        }
+        let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
         let until = Instant::now() + END_TIME;
         while Instant::now() < until {
             if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {

@@ -28,7 +28,7 @@ use pinion_sim::{AskedPath, Recorder, SimProbe, compare, write_svg};
 use serde_json::Value;
 
 use crate::camera::picture;
-use crate::own::serve::{Folder, Own};
+use crate::own::serve::{Folder, Own, section_of};
 use crate::own::{Kind, kind_of};
 pub(crate) use host::Running;
 use host::{Host, Refused};
@@ -38,6 +38,9 @@ use report::{Outcome, Report};
 
 /// How long klippy has to be ready.
 const READY: Duration = Duration::from_secs(90);
+/// How long klippy has to learn the MCUs' clocks, and how far off an MCU's rate may be.
+const CLOCKS: Duration = Duration::from_secs(10);
+const CLOCKS_OFF: f64 = 1e-4;
 /// How long homing, leveling or a macro may take.
 const LONG: Duration = Duration::from_secs(400);
 /// How long a print may take.
@@ -325,7 +328,10 @@ impl Trial<'_> {
         let until = Instant::now() + READY;
         loop {
             match self.host.state() {
-                Ok((state, _)) if state == "ready" => return Ok(()),
+                Ok((state, _)) if state == "ready" => {
+                    self.until_clocks_agree();
+                    return Ok(());
+                }
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
                 Ok(_) => thread::sleep(Duration::from_millis(100)),
@@ -333,6 +339,26 @@ impl Trial<'_> {
                 Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
                 Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
             }
+        }
+    }
+
+    /// Waits until klippy knows the MCUs' clocks. Right after its start on a busy computer it can be milliseconds wrong, and
+    /// then it is late when it homes.
+    fn until_clocks_agree(&mut self) {
+        let names: Vec<String> = self.own.mcus.iter().map(|mcu| section_of(mcu)).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let until = Instant::now() + CLOCKS;
+        while Instant::now() < until {
+            let status = self.host.query(&names).unwrap_or_default();
+            let off = |mcu: &Value| {
+                let [now, nominal] =
+                    [&mcu["last_stats"]["freq"], &mcu["mcu_constants"]["CLOCK_FREQ"]].map(Value::as_f64);
+                now.zip(nominal).is_none_or(|(now, nominal)| (now / nominal - 1.0).abs() > CLOCKS_OFF)
+            };
+            if !names.iter().any(|name| off(&status[*name])) {
+                return;
+            }
+            thread::sleep(Duration::from_millis(200));
         }
     }
 

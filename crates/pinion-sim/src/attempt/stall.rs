@@ -50,7 +50,7 @@ impl Stalls {
             }
         });
         if let Err(error) = watched {
-            log::warn!("how long klippy waits for a processor is not shown: no thread can be started: {error}");
+            log::warn!("it will not show how long klippy waits for a processor: no thread can be started: {error}");
         }
         Stalls { longest_ns, _stop: stop }
     }

@@ -4,6 +4,7 @@
 
 #![forbid(unsafe_code)]
 
+use pinion_printer_config::pins::{MAIN, Pin};
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
 use super::drivers::motor_of;
@@ -259,6 +260,18 @@ fn beside(config: &Config, section: &Section) -> Result<(), Trouble> {
         }
         "mcu" if section.text("canbus_uuid").is_none() => {
             section.required("serial")?;
+        }
+        kind if kind.starts_with("stepper_") && section.text("endstop_pin").is_none() => {
+            let mcu = |section: &Section| {
+                let chip = Pin::parse(section.text("step_pin")?, true, true).ok()?.chip;
+                (chip == MAIN || has(&format!("mcu {chip}"))).then_some(chip)
+            };
+            // stepper_z for stepper_z1: its endstop stops both.
+            let first = kind.get(..9).and_then(|name| config.section(name)).and_then(mcu);
+            if mcu(section).zip(first).is_some_and(|(own, first)| own != first) {
+                let cause = "Multi-mcu homing not supported on multi-mcu shared axis";
+                return refused("step_pin", cause.into(), "put all motors of the axis on one MCU");
+            }
         }
         kind if kind.starts_with("tmc") && kind_of(kind) == Kind::Known => {
             let stepper = motor_of(section);

@@ -142,7 +142,7 @@ pub(crate) struct Folder {
 }
 
 /// The section of an MCU.
-pub(super) fn section_of(mcu: &str) -> String {
+pub(crate) fn section_of(mcu: &str) -> String {
     if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") }
 }
 
