@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The test program for the guest: cargo's test target `kernel_guest`, with `pinion` itself, other programs to measure,
-//! and their libraries.
+//! klippy if there is one, and their libraries.
 
 use std::env;
 use std::ffi::OsStr;
@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::str::FromStr;
 
+use super::klippy::Klippy;
 use pinion_testkit::initramfs::Archive;
 use pinion_testkit::process;
 
@@ -52,11 +53,13 @@ impl FromStr for OtherProgram {
 pub struct GuestProgram<'a> {
     path: PathBuf,
     others: &'a [OtherProgram],
+    klippy: Option<Klippy>,
 }
 
 impl<'a> GuestProgram<'a> {
     /// Builds it with cargo, in the profile of this harness.
     pub fn build(others: &'a [OtherProgram]) -> Result<GuestProgram<'a>, String> {
+        let klippy = Klippy::of_environment()?;
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
         cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
         cargo.args(["test", "--no-run", "--test", "kernel_guest", "--message-format", "json"]);
@@ -71,8 +74,13 @@ impl<'a> GuestProgram<'a> {
             .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
             .find(|message| message["target"]["name"] == "kernel_guest" && message["executable"].is_string())
             .and_then(|message| message["executable"].as_str().map(PathBuf::from))
-            .map(|path| GuestProgram { path, others })
+            .map(|path| GuestProgram { path, others, klippy })
             .ok_or_else(|| "cargo built no test target `kernel_guest`".into())
+    }
+
+    /// Whether the guest has klippy.
+    pub fn has_klippy(&self) -> bool {
+        self.klippy.is_some()
     }
 
     /// The names of its tests, in libtest's order.
@@ -99,6 +107,9 @@ impl<'a> GuestProgram<'a> {
         for other in self.others {
             archive.copy(&other.path_inside(), &other.path)?;
         }
+        if let Some(klippy) = &self.klippy {
+            klippy.add_to(&mut archive)?;
+        }
         for library in libraries(&self.programs())? {
             let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
             archive.program(&library, &content);
@@ -108,11 +119,17 @@ impl<'a> GuestProgram<'a> {
 
     /// Changes with everything that makes the payload.
     pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
-        for source in [include_str!("guest_program.rs"), pinion_testkit::initramfs::SOURCE, include_str!("init.sh")] {
+        for source in [
+            include_str!("guest_program.rs"),
+            include_str!("klippy.rs"),
+            pinion_testkit::initramfs::SOURCE,
+            include_str!("init.sh"),
+        ] {
             source.hash(hasher);
         }
         let libraries = libraries(&self.programs())?;
-        for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)) {
+        let klippy = self.klippy.iter().flat_map(Klippy::files);
+        for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)).chain(klippy) {
             let describe = |error| format!("cannot read {}: {error}", path.display());
             let metadata = fs::metadata(path).map_err(describe)?;
             // cargo and dpkg replace a file, so no file changes without a change of these values.
@@ -123,7 +140,13 @@ impl<'a> GuestProgram<'a> {
 
     fn programs(&self) -> Vec<&Path> {
         let others = self.others.iter().map(|other| other.path.as_path());
-        [self.path.as_path(), pinion()].into_iter().chain(HOST_PROGRAMS.map(Path::new)).chain(others).collect()
+        let klippy = self.klippy.iter().flat_map(Klippy::programs);
+        [self.path.as_path(), pinion()]
+            .into_iter()
+            .chain(HOST_PROGRAMS.map(Path::new))
+            .chain(others)
+            .chain(klippy)
+            .collect()
     }
 }
 

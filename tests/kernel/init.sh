@@ -39,9 +39,9 @@ kernel_log() {
 export LLVM_PROFILE_FILE=/tmp/tests/output/%m%c.profraw
 
 run_test() {
-	MEASURED_PROGRAM=$2 timeout -s KILL 60 guest --exact "$1" --nocapture </dev/null
+	MEASURED_PROGRAM=$2 timeout -s KILL 120 guest --exact "$1" --nocapture </dev/null
 	status=$?
-	[ $status = 137 ] && echo "killed: it took longer than 60 s"
+	[ $status = 137 ] && echo "killed: it took longer than 120 s"
 	kernel_log || status=99
 	return $status
 }

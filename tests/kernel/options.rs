@@ -32,8 +32,8 @@ pub struct Options {
     pub shell: bool,
 }
 
-/// Figures that search for a rate. They take minutes, so they run only if a filter asks for them, such as `figures`.
-const SEARCHES: &str = "figures::most_steps";
+/// Figures that take minutes: a search for a rate, prints. They run only if a filter asks for them, such as `figures`.
+const LONG: [&str; 2] = ["figures::most_steps", "figures::print"];
 
 impl Options {
     /// Exits after an error, and for `--help`.
@@ -56,6 +56,6 @@ impl Options {
     pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
         self.flavour.is_none_or(|only| only == flavour)
             && self.arguments.selects(name)
-            && (!name.contains(SEARCHES) || self.arguments.has_filter())
+            && (!LONG.iter().any(|long| name.contains(long)) || self.arguments.has_filter())
     }
 }

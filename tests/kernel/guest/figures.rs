@@ -4,6 +4,8 @@
 //!
 //! Only Pinion's figures are asserted.
 
+mod print;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::process::CommandExt;

@@ -65,7 +65,7 @@ pub fn entry_with(folder: &str, name: &str, value: &str) -> PathBuf {
 }
 
 /// Waits for the result of another thread or process.
-pub fn wait_until(what: &str, condition: impl Fn() -> bool) {
+pub fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(10);
     while !condition() {
         assert!(Instant::now() < deadline, "waited in vain until {what}");

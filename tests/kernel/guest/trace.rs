@@ -44,10 +44,21 @@ struct Event {
 
 impl Trace {
     pub fn start() -> Trace {
+        Trace::with_filter("0")
+    }
+
+    /// Records the writes to one line, by the kernel's number of the line.
+    pub fn of_line(line: u32) -> Trace {
+        Trace::with_filter(&format!("gpio == {line}"))
+    }
+
+    /// The kernel records everything with the filter 0.
+    fn with_filter(filter: &str) -> Trace {
         set("tracing_on", "0");
         set("trace", "");
         set("trace_clock", "mono");
         set("buffer_size_kb", "8192");
+        set("events/gpio/gpio_value/filter", filter);
         set("events/gpio/gpio_value/enable", "1");
         let format = get("events/gpio/gpio_value/format");
         let offset = |field: &str| {
