@@ -119,6 +119,15 @@ fn the_description_of_a_printer_cfg_is_a_description() {
     assert!(laid.contains("start_mm = 77.0") && laid.matches("name = \"x\"").count() == 1, "{laid}");
 }
 
+/// A step that is misspelled would try nothing, and pass.
+#[test]
+fn an_unknown_step_of_a_try_is_refused() {
+    let (_home, cfg) = folder_with("printer.cfg", PRINTER);
+    let (status, _, log) = output(&["sim", cfg.to_str().unwrap(), "--try", "--only", "homed,haeted"]);
+    assert_eq!(status, Some(2), "{log}");
+    assert!(log.contains("haeted") && log.contains("heated"), "{log}");
+}
+
 #[test]
 fn a_try_without_a_klippy_says_what_to_name() {
     let (_home, cfg) = folder_with("printer.cfg", PRINTER);

@@ -21,6 +21,7 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use clap::builder::PossibleValuesParser;
 use pinion::cli::files;
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_printer_config::{Limit, Place, Section, Trouble};
@@ -199,6 +200,11 @@ const STEPS: &[Step] = &[
     Step { name: "printed", run: |trial| trial.printed() },
     Step { name: "cooled", run: |trial| trial.cooled() },
 ];
+
+/// The names of the steps, for the command line.
+pub(crate) fn steps() -> PossibleValuesParser {
+    PossibleValuesParser::new(STEPS.iter().map(|step| step.name))
+}
 
 /// Whether a step comes before anything is homed.
 fn is_first(step: &str) -> bool {

@@ -27,8 +27,9 @@ pub(crate) struct OwnArgs {
     /// Print this file in --try, in place of a small square
     #[arg(long, value_name = "FILE", requires = "attempt")]
     gcode: Option<PathBuf>,
-    /// Try only this step, and that klippy is ready; may be given several times
-    #[arg(long, value_name = "STEP", requires = "attempt")]
+    /// Try only these steps, and that klippy is ready: for example homed,heated
+    #[arg(long, value_name = "STEP", requires = "attempt", value_delimiter = ',', value_parser = attempt::steps(),
+        hide_possible_values = true)]
     only: Vec<String>,
     /// Write the report of --try as JSON
     #[arg(long, requires = "attempt")]
