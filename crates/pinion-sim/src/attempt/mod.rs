@@ -282,7 +282,8 @@ impl Trial<'_> {
     }
 
     /// Runs a step. It is repeated if klippy stopped because it or an MCU was late. If this computer made them late each
-    /// time, the step says nothing about the printer.
+    /// time, the step says nothing about the printer. Any other failure of a late klippy is tried once more: a probe that
+    /// answers late homes at another height.
     fn tried(&mut self, step: &Step) -> Outcome {
         let mut tries = TRIES;
         loop {
@@ -290,11 +291,13 @@ impl Trial<'_> {
             let outcome = (step.run)(self);
             let stall = self.host.stalls.take();
             let Outcome::Failed { cause, .. } = &outcome else { return outcome };
-            if !BUSY.iter().any(|words| cause.contains(words)) || self.broken.is_some() {
+            let is_busy = BUSY.iter().any(|words| cause.contains(words));
+            if self.broken.is_some() || !is_busy && (stall < STALL || tries < TRIES) {
                 return outcome;
             }
             if tries == 0 || !self.begins_again(step.name) {
-                return if stall < STALL { outcome } else { Outcome::Slow { cause: cause.clone(), stall } };
+                let is_slow = is_busy && stall >= STALL;
+                return if is_slow { Outcome::Slow { cause: cause.clone(), stall } } else { outcome };
             }
             tries -= 1;
         }

@@ -17,6 +17,10 @@ const RESERVE: f64 = 1.3;
 const J_PER_K: f64 = 15.0;
 /// klippy's PID parameters are for a power of 0 to this.
 const PID_BASE: f64 = 255.0;
+/// An integral part with a longer time than this adds nothing before klippy's verify_heater looks, after 20 s.
+const SLOW_INTEGRAL_S: f64 = 120.0;
+/// How far below its target a heater may stay by its proportional part alone. verify_heater allows 5.
+const BELOW_KELVIN: f64 = 3.0;
 
 /// The kinds of a section with a sensor, and their highest temperatures if the section has none.
 fn has_sensor(kind: &str) -> bool {
@@ -68,7 +72,7 @@ impl Translator<'_> {
             Some(pin) => {
                 let rate = self.kelvin_per_second(section)?;
                 let watts = rate * J_PER_K;
-                let reach = (RESERVE * (max - AMBIENT_CELSIUS)).max(50.0);
+                let reach = (RESERVE * (max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, max)?);
                 entry
                     .set("pin", pin.as_str())
                     .set("heater_watts", watts)
@@ -187,6 +191,14 @@ impl Translator<'_> {
         let by_p = number("pid_kp")?.map_or(usual, |kp| PID_BASE / kp);
         let by_d = number("pid_kd")?.map_or(usual, |kd| 2.0 * PID_BASE / kd);
         Ok(usual.min(by_p).min(by_d).max(slowest))
+    }
+
+    /// How far above the surroundings full power has to reach so that a PID whose integral part is slow holds its target.
+    fn reach_by_p(&self, section: &Section, max: f64) -> Result<f64, Trouble> {
+        let number = |key: &str| section.number(key, Limit::Any).map(|number| number.unwrap_or(0.0));
+        let (kp, ki) = (number("pid_kp")?, number("pid_ki")?);
+        let is_slow = section.text("control") == Some("pid") && kp > 0.0 && kp > SLOW_INTEGRAL_S * ki;
+        Ok(if is_slow { (max - AMBIENT_CELSIUS) * PID_BASE / (kp * BELOW_KELVIN) } else { 0.0 })
     }
 
     fn fan(&mut self, section: &Section) -> Result<(), Trouble> {

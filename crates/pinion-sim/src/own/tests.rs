@@ -80,6 +80,18 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
 }
 
 #[test]
+fn a_heater_whose_integral_part_is_slow_holds_its_target_by_its_gain() {
+    let text = PRINTER.replace("pid_Kp: 22\npid_Ki: 1\n", "pid_Kp: 20\npid_Ki: 0.02\n");
+    assert_ne!(text, PRINTER);
+    let Translated { description, .. } = translated(&text).unwrap();
+    let hot = named(&description, "heater", "name", "extruder");
+    let number = |key: &str| hot[key].as_float().unwrap();
+    // The power that holds 200 degrees, as klippy's PID gives it with an error of this many kelvin.
+    let power = (200.0 - 25.0) * number("loss_w_per_k") / number("heater_watts");
+    assert!(255.0 * power / 20.0 < 3.0, "{power}");
+}
+
+#[test]
 fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
     let start = |text: &str| -> Vec<f64> {
         let Translated { description, .. } = translated(text).unwrap();
