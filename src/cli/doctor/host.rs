@@ -8,9 +8,10 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::computer::units::{self, setting};
 use crate::cli::computer::{Computer, Who};
-use crate::cli::finding::Finding;
+use crate::cli::finding::{Finding, Level};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::Checkout;
 use pinion_runtime::klippy::process::{self, Process};
@@ -26,8 +27,8 @@ pub(in crate::cli) struct Klippy {
     folder: Option<PathBuf>,
     /// The path of its configuration, if the command line has all of it.
     pub(in crate::cli) config: Option<PathBuf>,
-    /// Its configuration. `None` if it cannot be read.
-    pub(super) printer: Option<Printer>,
+    /// Its configuration, or why the doctor cannot use it. `None` if its path is not known.
+    printer: Option<Result<Printer, Trouble>>,
     /// How it was found.
     pub(super) found_by: String,
     /// The unit that starts it, without `.service`.
@@ -37,9 +38,14 @@ pub(in crate::cli) struct Klippy {
 }
 
 impl Klippy {
+    /// Its configuration, if the doctor can use it.
+    pub(super) fn printer(&self) -> Option<&Printer> {
+        self.printer.as_ref()?.as_ref().ok()
+    }
+
     /// Whether it opens this link, as far as is known.
     pub(super) fn opens(&self, link: &Path) -> bool {
-        self.printer.as_ref().is_none_or(|printer| printer.serials.contains(link))
+        self.printer().is_none_or(|printer| printer.serials.contains(link))
     }
 
     pub(super) fn restart(&self) -> String {
@@ -69,7 +75,7 @@ fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Opti
         who: computer.user_of(process.pid)?,
         config: named,
         folder: process.klippy_folder(&proc).map(|folder| reachable(computer, folder)),
-        printer: config.and_then(|config| printer::read(computer, &config)),
+        printer: config.map(|config| printer::read(computer, &config)),
         found_by: format!("process {}", process.pid),
         unit,
         is_running: true,
@@ -91,7 +97,7 @@ fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
         who,
         folder: Some(computer.path(folder)),
         config: process::klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
-        printer: process::klippy_config(&arguments).and_then(|config| printer::read(computer, config)),
+        printer: process::klippy_config(&arguments).map(|config| printer::read(computer, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),
         is_running: false,
@@ -114,8 +120,20 @@ fn arguments(computer: &Computer, unit: &str) -> Option<Vec<PathBuf>> {
     })
 }
 
+/// The checks that are left out because a klippy's configuration cannot be used.
+pub(super) fn unchecked(klippys: &[Klippy]) -> Vec<Finding> {
+    let refused = klippys.iter().filter_map(|klippy| klippy.printer.as_ref()?.as_ref().err());
+    let finding = |trouble: &Trouble| {
+        let cause = format!("{}, so its LEDs, UARTs, pins and devices are not checked", trouble.cause);
+        Finding::of("printer_cfg", Level::Warning, Trouble { cause: cause.into(), ..trouble.clone() })
+    };
+    let mut findings: Vec<Finding> = refused.map(finding).collect();
+    findings.dedup();
+    findings
+}
+
 pub(super) fn printers(klippys: &[Klippy]) -> impl Iterator<Item = &Printer> {
-    klippys.iter().filter_map(|klippy| klippy.printer.as_ref())
+    klippys.iter().filter_map(Klippy::printer)
 }
 
 /// The pins of LEDs on SPI buses in the klippys' configurations.
@@ -237,11 +255,11 @@ mod tests {
             "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg -l /home/pi/k.log\"\n",
         );
         let found = klippys(&tree.computer()).remove(0);
-        assert_eq!((found.who.uid, found.found_by.as_str(), &found.printer), (PI, "klipper.service", &None));
+        assert_eq!((found.who.uid, found.found_by.as_str(), found.printer()), (PI, "klipper.service", None));
         assert_eq!(found.folder.unwrap(), tree.computer().path("/home/pi/klipper/klippy"));
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
-        let printer = klippys(&tree.computer()).remove(0).printer;
-        assert_eq!(printer.unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
+        let found = klippys(&tree.computer()).remove(0);
+        assert_eq!(found.printer().unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
         // An enabled unit counts, and a klippy that runs is not counted twice.
         tree.put(
             "etc/systemd/system/klipper-2.service",
