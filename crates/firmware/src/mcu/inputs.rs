@@ -9,7 +9,8 @@ use crate::board::{Line, Pin};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::lines::{Claim, Level, Repeated};
+use super::claims::Claim;
+use super::level::{Level, Repeated};
 use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
 
 /// Reads an input of a chip that may sleep.
