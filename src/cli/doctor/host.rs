@@ -14,7 +14,8 @@ use pinion_firmware::mcu::DialectName;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::Checkout;
-use pinion_runtime::klippy::process::{self, Process};
+use pinion_runtime::klippy::command_line::{self, klippy_config};
+use pinion_runtime::klippy::process::Process;
 
 use super::UPGRADE;
 use super::instance::Instance;
@@ -70,7 +71,7 @@ pub(in crate::cli) fn klippys(computer: &Computer) -> Vec<Klippy> {
 fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Option<Klippy> {
     let proc = computer.path("/proc");
     let config = process.klippy_config(&proc).map(|config| computer.name(&config));
-    let named = process::klippy_config(&process.arguments).filter(|config| config.is_absolute()).map(Path::to_owned);
+    let named = klippy_config(&process.arguments).filter(|config| config.is_absolute()).map(Path::to_owned);
     Some(Klippy {
         who: computer.user_of(process.pid)?,
         config: named,
@@ -86,7 +87,7 @@ fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Opti
 fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
     let text = units::text(computer, unit)?;
     let arguments = arguments(computer, &text)?;
-    let folder = process::klippy(&arguments).filter(|folder| folder.is_absolute())?;
+    let folder = command_line::klippy(&arguments).filter(|folder| folder.is_absolute())?;
     let user = setting(&text, "User").unwrap_or("root");
     let who = computer.user(user).unwrap_or_else(|| match user {
         "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
@@ -96,8 +97,8 @@ fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
     Some(Klippy {
         who,
         folder: Some(computer.path(folder)),
-        config: process::klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
-        printer: process::klippy_config(&arguments).map(|config| printer::read(computer, config)),
+        config: klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
+        printer: klippy_config(&arguments).map(|config| printer::read(computer, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),
         is_running: false,
@@ -116,7 +117,7 @@ fn arguments(computer: &Computer, unit: &str) -> Option<Vec<PathBuf>> {
     texts.into_iter().flatten().find_map(|text| {
         let words = text.split([' ', '\t', '\n', '"', '\'', '=']).filter(|word| !word.is_empty());
         let words: Vec<PathBuf> = words.map(PathBuf::from).collect();
-        process::klippy(&words).is_some().then_some(words)
+        command_line::klippy(&words).is_some().then_some(words)
     })
 }
 
