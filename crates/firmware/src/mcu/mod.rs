@@ -51,7 +51,7 @@ pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, 
 pub use context::Context;
 pub use dialect::{Dialect, Firmware};
 pub use dialects::{DialectName, Dialects, only, since, until};
-pub use inputs::{InputLine, Look};
+pub use inputs::{InputLine, Sample};
 pub use job::{AnyJob, DeviceId, Devices, Finished, Job, SentJob, WorkerId, Workers};
 pub use job_slot::{Back, JobSlot};
 pub use level::EdgeRecorder;
