@@ -73,9 +73,9 @@ pub(super) fn scan(dev: &Path, class: &Path) -> Vec<Uart> {
     attributes::names(class).into_iter().filter_map(port).collect()
 }
 
-/// Whether this is the kernel's end of a pseudo terminal (devices.txt: the majors of Unix98 PTY slaves).
-fn is_pseudo(terminal: &File) -> bool {
-    terminal.metadata().is_ok_and(|about| (136..=143).contains(&major(about.rdev())))
+/// Whether a file is a pseudo terminal (admin-guide/devices.txt: the majors of Unix98 PTY slaves).
+pub fn is_pseudo_terminal(file: &Metadata) -> bool {
+    file.file_type().is_char_device() && (136..=143).contains(&major(file.rdev()))
 }
 
 /// Opens the terminal at this path: raw, with eight data bits, no parity and one stop bit. No other program may open it
@@ -95,7 +95,7 @@ fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
     let mut settings = tcgetattr(&*file).map_err(no_port)?;
     // The kernel forgets this when the port is closed, however Pinion ends. But a pseudo terminal lives as long as the
     // program at its other end, for example socat, and would refuse the next Pinion.
-    if !is_pseudo(&file) {
+    if !file.metadata().is_ok_and(|about| is_pseudo_terminal(&about)) {
         sys::make_exclusive(&*file).map_err(no_port)?;
     }
     cfmakeraw(&mut settings);

@@ -12,8 +12,9 @@ use std::path::{Path, PathBuf};
 use nix::unistd::geteuid;
 
 use crate::host::klippy::process::{self, Process};
-use crate::host::klippy::terminal::{is_pseudo_terminal, server};
+use crate::host::klippy::terminal::server;
 use pinion_linux::foreign;
+use pinion_linux::uart::is_pseudo_terminal;
 
 /// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;

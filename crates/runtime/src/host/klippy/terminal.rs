@@ -19,8 +19,6 @@ const OPEN_FILES_MAX: usize = 4096;
 /// Highest number of inspected files of all processes that may not open the terminal. Any user can have
 /// many processes with many files. To inspect one takes 2 us to 20 us.
 const UNLIKELY_FILES_MAX: usize = 10_000;
-/// The major numbers of pseudo terminals (admin-guide/devices.txt).
-const PSEUDO_MAJORS: std::ops::RangeInclusive<u64> = 136..=143;
 
 /// The process that has the terminal open.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -105,11 +103,6 @@ pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
         }
     }
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
-}
-
-/// Whether a file is a pseudo terminal.
-pub fn is_pseudo_terminal(file: &fs::Metadata) -> bool {
-    file.file_type().is_char_device() && PSEUDO_MAJORS.contains(&nix::sys::stat::major(file.rdev()))
 }
 
 /// The process, other than this one, that serves the terminal `device`: it has the master end open. `None` if this
