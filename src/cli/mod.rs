@@ -16,7 +16,7 @@ use nix::unistd::getpid;
 
 use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
-use pinion_runtime::klippy::process::is_pseudo_terminal;
+use pinion_linux::uart::is_pseudo_terminal;
 
 mod add;
 mod attach;

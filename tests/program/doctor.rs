@@ -287,6 +287,36 @@ fn a_false_pinion_of_the_host_changes_no_advice() {
     assert!(after.contains(told) && !after.contains("usermod"), "{after}");
 }
 
+/// klippy would refuse the configuration. So the doctor does not know its devices.
+#[test]
+fn checks_that_a_wrong_printer_cfg_leaves_out_are_named_with_its_line() {
+    let tree = Tree::printer();
+    let uart = "[mcu host]\nserial: /tmp/klipper_host_mcu\n[tmc2209 a]\nuart_pin: host:ttyAMA7\n";
+    let doctor = |text: &str| {
+        tree.put("home/pi/printer.cfg", text);
+        tree.doctor()
+    };
+    let right = doctor(uart);
+    assert!(right.contains("ttyAMA7") && !right.contains("not checked"), "{right}");
+    let left_out = "so its LEDs, UARTs, pins and devices are not checked\n           -> ";
+    for (wrong, cause, remedy) in [
+        ("no value\n", "5: Source contains parsing errors: 'no value'", "write `option: value`"),
+        ("[include printer.cfg]\n", "5: Recursive include of config file '/home/pi/printer.cfg'", "remove the line\n"),
+        (
+            "[include a.cfg]\n",
+            "5: /home/pi/a.cfg: Unable to open config file: No such file or directory (os error 2)",
+            "correct its name\n",
+        ),
+    ] {
+        let text = doctor(&format!("{uart}{wrong}"));
+        let line = format!("  warning  /home/pi/printer.cfg:{cause}, {left_out}{remedy}");
+        assert!(text.contains(&line) && !text.contains("ttyAMA7"), "{line}\n{text}");
+    }
+    fs::remove_file(tree.path("home/pi/printer.cfg")).unwrap();
+    let text = tree.doctor();
+    assert!(text.contains("/home/pi/printer.cfg: Unable to open config file: ") && text.contains(left_out), "{text}");
+}
+
 #[test]
 fn a_name_in_the_configuration_that_leads_out_of_dev_opens_nothing() {
     let tree = Tree::printer();

@@ -357,7 +357,7 @@ impl Client {
     }
 
     /// Renews the estimate of the clock from the shortest of several round trips.
-    pub fn estimate_clock(&mut self, round_trips: u32) -> Result<(), Error> {
+    fn estimate_clock(&mut self, round_trips: u32) -> Result<(), Error> {
         let mut best: Option<(Duration, Instant, u32)> = None;
         for _ in 0..round_trips.max(1) {
             let sent = Instant::now();
@@ -375,7 +375,7 @@ impl Client {
     }
 
     /// The estimated clock of the MCU at an instant of this computer.
-    pub fn clock_at_instant(&self, at: Instant) -> Clock {
+    pub(crate) fn clock_at_instant(&self, at: Instant) -> Clock {
         let ticks = |span: Duration| (span.as_secs_f64() * self.frequency_hz) as i64;
         let since = match at.checked_duration_since(self.clock_at) {
             Some(span) => ticks(span),

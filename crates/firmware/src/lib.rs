@@ -13,7 +13,7 @@
 //! # An MCU with one feature of its own, in virtual time
 //!
 //! The feature answers `echo` with the number that it received and the time. The board is from the crate
-//! `pinion-testbench`. It records what an MCU does to its pins.
+//! `pinion-testbench`. It records the edges that an MCU makes on its pins.
 //!
 //! ```
 //! use std::sync::{Arc, Mutex};
@@ -50,7 +50,7 @@
 //!     place_of_response(FEATURES, format)
 //! }
 //!
-//! /// Keeps what the MCU says to its host.
+//! /// Keeps the MCU's responses to its host.
 //! #[derive(Clone, Default)]
 //! struct Said(Arc<Mutex<Vec<Vec<u8>>>>);
 //!

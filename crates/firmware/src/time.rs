@@ -194,7 +194,7 @@ impl TimeSource for VirtualClock {
         self.set(end);
     }
 
-    /// The work has its own time, which begins now, as on another thread. The clock itself does not advance.
+    /// The work runs in a time that begins now, as on another thread. The clock itself does not advance.
     fn run_job(&self, work: &mut dyn FnMut()) -> Clock {
         let now = self.now();
         work();

@@ -12,7 +12,7 @@ use nix::sys::socket::{
 };
 use nix::sys::time::{TimeVal, TimeValLike as _};
 
-use crate::sysfs;
+use crate::attributes;
 
 /// Where the kernel lists network interfaces.
 const NET: &str = "/sys/class/net";
@@ -54,13 +54,14 @@ pub struct CanInterface {
 
 /// The names of this computer's CAN interfaces, in order.
 pub fn interfaces() -> Vec<String> {
-    let is_can = |name: &String| sysfs::text(&Path::new(NET).join(name).join("type")).as_deref() == Some(ARPHRD_CAN);
-    sysfs::names(Path::new(NET)).into_iter().filter(is_can).collect()
+    let is_can =
+        |name: &String| attributes::text(&Path::new(NET).join(name).join("type")).as_deref() == Some(ARPHRD_CAN);
+    attributes::names(Path::new(NET)).into_iter().filter(is_can).collect()
 }
 
 /// Whether there is a network interface of this name that is no CAN interface.
 pub fn is_other(name: &str) -> bool {
-    sysfs::text(&Path::new(NET).join(name).join("type")).is_some_and(|type_| type_ != ARPHRD_CAN)
+    attributes::text(&Path::new(NET).join(name).join("type")).is_some_and(|type_| type_ != ARPHRD_CAN)
 }
 
 /// Asks the kernel about an interface.
@@ -69,7 +70,7 @@ pub fn is_other(name: &str) -> bool {
 ///
 /// There is no interface of this name (`NotFound`), or the kernel does not answer.
 pub fn interface(name: &str) -> io::Result<CanInterface> {
-    let index = sysfs::text(&Path::new(NET).join(name).join("ifindex"));
+    let index = attributes::text(&Path::new(NET).join(name).join("ifindex"));
     let index: i32 = index.and_then(|index| index.parse().ok()).ok_or(io::ErrorKind::NotFound)?;
     let mut answer = vec![0; ANSWER_BYTES_MAX];
     let socket = ask(index)?;

@@ -5,6 +5,7 @@
 #![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
 pub mod adc;
+mod attributes;
 mod board;
 pub mod can;
 pub mod clock;

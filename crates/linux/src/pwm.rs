@@ -12,8 +12,8 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
+use super::attributes::{names, target, text};
 use super::guard::SharedGuard;
-use super::sysfs::{names, target, text};
 use pinion_firmware::board::{self, PWM_MAX, PwmConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};

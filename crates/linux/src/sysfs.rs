@@ -6,8 +6,9 @@
 #![forbid(unsafe_code)]
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::Path;
+
+use super::attributes::{names, target, text};
 
 /// The result of a search.
 #[derive(Debug, Default)]
@@ -75,25 +76,6 @@ impl Sysfs {
             devices: devices(&root.join("sys/kernel/debug/pinctrl")),
         }
     }
-}
-
-/// A file's text without the white space around it. `None` if there is no text.
-pub(super) fn text(path: &Path) -> Option<String> {
-    let text = fs::read_to_string(path).ok()?.trim().to_owned();
-    (!text.is_empty()).then_some(text)
-}
-
-/// The name of a symbolic link's target.
-pub(super) fn target(link: &Path) -> Option<String> {
-    fs::read_link(link).ok()?.file_name()?.to_str().map(str::to_owned)
-}
-
-/// The names in a folder, in order.
-pub(super) fn names(folder: &Path) -> Vec<String> {
-    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
-    names.sort();
-    names
 }
 
 fn pwm(class: &Path, debug: &Path) -> Vec<PwmChip> {
@@ -234,6 +216,7 @@ fn muxed_pin(line: &str) -> Option<(u32, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
     use std::os::unix::fs::symlink;
     use tempfile::TempDir;
 

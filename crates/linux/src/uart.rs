@@ -22,7 +22,7 @@ use pinion_firmware::trouble::Trouble;
 
 use crate::gpio::not_permitted;
 use crate::sys::{self, LineFaults};
-use crate::{LOOK_AT_LOG, sysfs};
+use crate::{LOOK_AT_LOG, attributes};
 
 /// The baud rates that a driver understands (TMC2209 data sheet, "UART Interface": 9600 to 500k). It measures the rate
 /// from the first bits of each message.
@@ -48,20 +48,21 @@ pub struct Uart {
 
 /// The serial ports in `class` (/sys/class/tty), in order. Terminals without hardware are no ports.
 pub(super) fn scan(dev: &Path, class: &Path) -> Vec<Uart> {
-    let consoles = sysfs::text(&class.join("console/active")).unwrap_or_default();
+    let consoles = attributes::text(&class.join("console/active")).unwrap_or_default();
     let links: Vec<(String, String)> = ["", "serial/by-id/"]
         .into_iter()
-        .flat_map(|folder| sysfs::names(&dev.join(folder)).into_iter().map(move |name| format!("{folder}{name}")))
+        .flat_map(|folder| attributes::names(&dev.join(folder)).into_iter().map(move |name| format!("{folder}{name}")))
         .filter(|name| name.starts_with("serial"))
-        .filter_map(|name| sysfs::target(&dev.join(&name)).map(|target| (name, target)))
+        .filter_map(|name| attributes::target(&dev.join(&name)).map(|target| (name, target)))
         .collect();
     let port = |name: String| {
         let folder = class.join(&name);
         // The driver of PC ports makes terminals for ports that are not there. Their type is 0.
-        if !folder.join("device").exists() || sysfs::text(&folder.join("type")).is_some_and(|type_| type_ == "0") {
+        if !folder.join("device").exists() || attributes::text(&folder.join("type")).is_some_and(|type_| type_ == "0") {
             return None;
         }
-        let (major, minor) = sysfs::text(&folder.join("dev"))?.split_once(':').map(|(a, b)| (a.parse(), b.parse()))?;
+        let (major, minor) =
+            attributes::text(&folder.join("dev"))?.split_once(':').map(|(a, b)| (a.parse(), b.parse()))?;
         Some(Uart {
             device: (major.ok()?, minor.ok()?),
             links: links.iter().filter(|(_, target)| *target == name).map(|(link, _)| link.clone()).collect(),
@@ -69,12 +70,12 @@ pub(super) fn scan(dev: &Path, class: &Path) -> Vec<Uart> {
             name,
         })
     };
-    sysfs::names(class).into_iter().filter_map(port).collect()
+    attributes::names(class).into_iter().filter_map(port).collect()
 }
 
-/// Whether this is the kernel's end of a pseudo terminal (devices.txt: the majors of Unix98 PTY slaves).
-fn is_pseudo(terminal: &File) -> bool {
-    terminal.metadata().is_ok_and(|about| (136..=143).contains(&major(about.rdev())))
+/// Whether a file is a pseudo terminal (admin-guide/devices.txt: the majors of Unix98 PTY slaves).
+pub fn is_pseudo_terminal(file: &Metadata) -> bool {
+    file.file_type().is_char_device() && (136..=143).contains(&major(file.rdev()))
 }
 
 /// Opens the terminal at this path: raw, with eight data bits, no parity and one stop bit. No other program may open it
@@ -94,7 +95,7 @@ fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
     let mut settings = tcgetattr(&*file).map_err(no_port)?;
     // The kernel forgets this when the port is closed, however Pinion ends. But a pseudo terminal lives as long as the
     // program at its other end, for example socat, and would refuse the next Pinion.
-    if !is_pseudo(&file) {
+    if !file.metadata().is_ok_and(|about| is_pseudo_terminal(&about)) {
         sys::make_exclusive(&*file).map_err(no_port)?;
     }
     cfmakeraw(&mut settings);
@@ -121,7 +122,7 @@ pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
             return Err(no_port(Errno::ENOTTY));
         }
         let name = target.file_name().unwrap_or_default().to_string_lossy();
-        let consoles = sysfs::text(&Path::new(crate::places::TTY).join("console/active")).unwrap_or_default();
+        let consoles = attributes::text(&Path::new(crate::places::TTY).join("console/active")).unwrap_or_default();
         if consoles.split_whitespace().any(|console| console == name) {
             return Err(console());
         }

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -89,6 +90,15 @@ fn saved_lines(block: &str) -> Option<Vec<&str>> {
     block.trim_end().lines().map(|line| strip(line).map(|mark| &line[mark..])).collect()
 }
 
+/// The remedy for a file that cannot be read.
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::NotFound => "correct its name",
+        io::ErrorKind::PermissionDenied => "let this user read it, or use sudo",
+        _ => "name a readable printer.cfg",
+    }
+}
+
 struct Reader<'a> {
     files: &'a dyn Files,
     config: Config,
@@ -108,7 +118,7 @@ impl Reader<'_> {
         let text = self
             .files
             .text(path)
-            .map_err(|error| refused(format!("Unable to open config file: {error}"), "name a readable printer.cfg"))?;
+            .map_err(|error| refused(format!("Unable to open config file: {error}"), remedy(&error)))?;
         self.bytes += text.len();
         if self.bytes > BYTES_MAX {
             return Err(refused(format!("the files have more than {} MiB", BYTES_MAX >> 20), "include fewer"));
@@ -120,7 +130,8 @@ impl Reader<'_> {
     fn include(&mut self, file: &Arc<Path>, text: &str) -> Result<(), Trouble> {
         let whole = self.files.whole(file);
         if self.within.contains(&whole) {
-            return Err(format!("Recursive include of config file '{}'", file.display()).into());
+            let cause = format!("Recursive include of config file '{}'", file.display());
+            return Err(Trouble::new(cause).remedy("remove the line"));
         }
         self.within.push(whole);
         let mut lines = Vec::new();

@@ -67,7 +67,7 @@ fn what_klippy_refuses_is_refused_with_its_line() {
         assert!(refusal(text).starts_with(line), "{}", refusal(text));
     }
     let circle = read_all(&[("p.cfg", "[include a.cfg]\n"), ("a.cfg", "\n[include p.cfg]\n")]).unwrap_err();
-    assert_eq!(circle, "p.cfg:1: a.cfg:2: Recursive include of config file 'p.cfg'");
+    assert_eq!(circle, "p.cfg:1: a.cfg:2: Recursive include of config file 'p.cfg': remove the line");
 }
 
 #[test]

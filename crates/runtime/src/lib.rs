@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A Klipper micro-controller as a Linux process: its threads, its links to the host, its guardian and recorder, and what
-//! it knows about a host from outside ([`klippy`]).
+//! A Klipper micro-controller as a Linux process: its threads, its links to the host, its guardian and recorder, and its
+//! knowledge about a host from outside ([`klippy`]).
 //!
 //! ```text
 //! host <-way-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
@@ -121,7 +121,7 @@ pub struct Options {
 }
 
 /// Serves a host until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
-/// `board` by `timing`, and the instants of `timing` are those of the recording's clock. `helpers` has the guardian of
+/// `board` by `timing`, and `timing` has the clock of the recording. `helpers` has the guardian of
 /// the board's outputs.
 pub fn run(
     options: &Options,

@@ -21,7 +21,7 @@ pub(crate) fn no_room(error: io::Error) -> Trouble {
     refused("Pinion cannot be started", error).remedy("raise LimitNOFILE, or free memory")
 }
 
-/// Adds what to do about a thread that cannot be started.
+/// Adds the remedy for a thread that cannot be started.
 pub fn started<T>(thread: io::Result<T>) -> Result<T, Trouble> {
     thread.map_err(|error| refused("no thread can be started", error).remedy(NO_PROCESS))
 }

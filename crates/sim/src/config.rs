@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::catalog::PartConfig;
 use super::description::axes::{AxisConfig, BedConfig, CarriageConfig, DeltaConfig, Limits};
-use super::description::boards::{Boards, McuConfig};
+use super::description::boards::{Boards, McuConfig, UsedPins};
 use super::description::buses::{I2cBusConfig, SpiBusConfig};
-use super::description::check::{Trouble, UsedPins, no_name, wrong};
+use super::description::check::{Trouble, no_name, wrong};
 use super::description::heater::{FanConfig, HeaterConfig};
 use super::description::kinematics::KinematicsConfig;
 use super::description::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use nix::sys::stat::{major, minor};
 
 use super::Computer;
-use pinion_runtime::klippy::process::is_pseudo_terminal;
+use pinion_linux::uart::is_pseudo_terminal;
 
 /// A serial port.
 #[derive(Clone, Debug, PartialEq, Eq)]

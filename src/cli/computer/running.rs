@@ -12,7 +12,8 @@ use crate::cli::{config, run_args};
 use pinion_linux::foreign::word;
 use pinion_runtime::helpers;
 use pinion_runtime::klippy::HOST_PATHS;
-use pinion_runtime::klippy::process::{self, Ids, Process, Search};
+use pinion_runtime::klippy::process::{self, Ids, Process};
+use pinion_runtime::klippy::terminal::{self, Search};
 
 use super::units::{self, setting};
 use super::{Computer, Who};
@@ -201,8 +202,8 @@ pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
         let link = pinion.settings.map_or_else(|| HOST_PATHS.to_owned() + "mcu", |by| by.symlink.display().to_string());
         // An absolute link replaces the folder before it.
         let link = proc.join(format!("{}/cwd", pinion.pid)).join(&link);
-        let terminal = fs::canonicalize(&link).and_then(|device| process::Terminal::of(&device));
-        let found = terminal.and_then(|terminal| process::find(&proc, terminal));
+        let terminal = fs::canonicalize(&link).and_then(|device| terminal::Terminal::of(&device));
+        let found = terminal.and_then(|terminal| terminal::find(&proc, terminal));
         let (host, is) = match found {
             Ok(Search::Nobody) => return None,
             Ok(Search::Found(host)) => (host, "is"),

@@ -8,12 +8,14 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::computer::units::{self, setting};
 use crate::cli::computer::{Computer, Who};
-use crate::cli::finding::Finding;
+use crate::cli::finding::{Finding, Level};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::Checkout;
-use pinion_runtime::klippy::process::{self, Process};
+use pinion_runtime::klippy::command_line::{self, klippy_config};
+use pinion_runtime::klippy::process::Process;
 
 use super::UPGRADE;
 use super::instance::Instance;
@@ -26,8 +28,8 @@ pub(in crate::cli) struct Klippy {
     folder: Option<PathBuf>,
     /// The path of its configuration, if the command line has all of it.
     pub(in crate::cli) config: Option<PathBuf>,
-    /// Its configuration. `None` if it cannot be read.
-    pub(super) printer: Option<Printer>,
+    /// Its configuration, or why the doctor cannot use it. `None` if its path is not known.
+    printer: Option<Result<Printer, Trouble>>,
     /// How it was found.
     pub(super) found_by: String,
     /// The unit that starts it, without `.service`.
@@ -37,9 +39,14 @@ pub(in crate::cli) struct Klippy {
 }
 
 impl Klippy {
+    /// Its configuration, if the doctor can use it.
+    pub(super) fn printer(&self) -> Option<&Printer> {
+        self.printer.as_ref()?.as_ref().ok()
+    }
+
     /// Whether it opens this link, as far as is known.
     pub(super) fn opens(&self, link: &Path) -> bool {
-        self.printer.as_ref().is_none_or(|printer| printer.serials.contains(link))
+        self.printer().is_none_or(|printer| printer.serials.contains(link))
     }
 
     pub(super) fn restart(&self) -> String {
@@ -64,12 +71,12 @@ pub(in crate::cli) fn klippys(computer: &Computer) -> Vec<Klippy> {
 fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Option<Klippy> {
     let proc = computer.path("/proc");
     let config = process.klippy_config(&proc).map(|config| computer.name(&config));
-    let named = process::klippy_config(&process.arguments).filter(|config| config.is_absolute()).map(Path::to_owned);
+    let named = klippy_config(&process.arguments).filter(|config| config.is_absolute()).map(Path::to_owned);
     Some(Klippy {
         who: computer.user_of(process.pid)?,
         config: named,
         folder: process.klippy_folder(&proc).map(|folder| reachable(computer, folder)),
-        printer: config.and_then(|config| printer::read(computer, &config)),
+        printer: config.map(|config| printer::read(computer, &config)),
         found_by: format!("process {}", process.pid),
         unit,
         is_running: true,
@@ -80,7 +87,7 @@ fn running(computer: &Computer, process: &Process, unit: Option<String>) -> Opti
 fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
     let text = units::text(computer, unit)?;
     let arguments = arguments(computer, &text)?;
-    let folder = process::klippy(&arguments).filter(|folder| folder.is_absolute())?;
+    let folder = command_line::klippy(&arguments).filter(|folder| folder.is_absolute())?;
     let user = setting(&text, "User").unwrap_or("root");
     let who = computer.user(user).unwrap_or_else(|| match user {
         "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
@@ -90,8 +97,8 @@ fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
     Some(Klippy {
         who,
         folder: Some(computer.path(folder)),
-        config: process::klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
-        printer: process::klippy_config(&arguments).and_then(|config| printer::read(computer, config)),
+        config: klippy_config(&arguments).filter(|config| config.is_absolute()).map(Path::to_owned),
+        printer: klippy_config(&arguments).map(|config| printer::read(computer, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),
         is_running: false,
@@ -110,12 +117,24 @@ fn arguments(computer: &Computer, unit: &str) -> Option<Vec<PathBuf>> {
     texts.into_iter().flatten().find_map(|text| {
         let words = text.split([' ', '\t', '\n', '"', '\'', '=']).filter(|word| !word.is_empty());
         let words: Vec<PathBuf> = words.map(PathBuf::from).collect();
-        process::klippy(&words).is_some().then_some(words)
+        command_line::klippy(&words).is_some().then_some(words)
     })
 }
 
+/// The checks that are left out because a klippy's configuration cannot be used.
+pub(super) fn unchecked(klippys: &[Klippy]) -> Vec<Finding> {
+    let refused = klippys.iter().filter_map(|klippy| klippy.printer.as_ref()?.as_ref().err());
+    let finding = |trouble: &Trouble| {
+        let cause = format!("{}, so its LEDs, UARTs, pins and devices are not checked", trouble.cause);
+        Finding::of("printer_cfg", Level::Warning, Trouble { cause: cause.into(), ..trouble.clone() })
+    };
+    let mut findings: Vec<Finding> = refused.map(finding).collect();
+    findings.dedup();
+    findings
+}
+
 pub(super) fn printers(klippys: &[Klippy]) -> impl Iterator<Item = &Printer> {
-    klippys.iter().filter_map(|klippy| klippy.printer.as_ref())
+    klippys.iter().filter_map(Klippy::printer)
 }
 
 /// The pins of LEDs on SPI buses in the klippys' configurations.
@@ -237,11 +256,11 @@ mod tests {
             "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg -l /home/pi/k.log\"\n",
         );
         let found = klippys(&tree.computer()).remove(0);
-        assert_eq!((found.who.uid, found.found_by.as_str(), &found.printer), (PI, "klipper.service", &None));
+        assert_eq!((found.who.uid, found.found_by.as_str(), found.printer()), (PI, "klipper.service", None));
         assert_eq!(found.folder.unwrap(), tree.computer().path("/home/pi/klipper/klippy"));
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
-        let printer = klippys(&tree.computer()).remove(0).printer;
-        assert_eq!(printer.unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
+        let found = klippys(&tree.computer()).remove(0);
+        assert_eq!(found.printer().unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
         // An enabled unit counts, and a klippy that runs is not counted twice.
         tree.put(
             "etc/systemd/system/klipper-2.service",

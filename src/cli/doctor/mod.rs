@@ -109,6 +109,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
             "pins and buses",
             [
                 devices::presence(computer),
+                host::unchecked(&klippys),
                 outputs::released(computer),
                 leds::leds(computer, &host::leds(&klippys)),
                 leds::line_leds(computer, &instances, &host::line_leds(&klippys)),

@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use pinion_printer_config::pins::{MAIN, Pin};
-use pinion_printer_config::{Config, Section};
+use pinion_printer_config::{Config, Section, Trouble};
 
 use crate::cli::computer::Computer;
 
@@ -27,10 +27,13 @@ pub(super) struct Printer {
     pub(super) numbered: BTreeSet<(PathBuf, String)>,
 }
 
-/// Reads a configuration, with the files that it includes. `None` if one of them cannot be read, or if klippy would
-/// refuse one.
-pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
-    let config = Config::read_from(computer, config).ok()?;
+/// Reads a configuration, with the files that it includes.
+///
+/// # Errors
+///
+/// One of the files cannot be read, or klippy would refuse it.
+pub(super) fn read(computer: &Computer, config: &Path) -> Result<Printer, Trouble> {
+    let config = Config::read_from(computer, config)?;
     let values = |kind: fn(&str) -> bool, key: &'static str| {
         let sections = config.sections().iter().filter(move |section| kind(section.kind()));
         sections.filter_map(move |section| section.text(key)).map(str::to_owned)
@@ -40,7 +43,7 @@ pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
     let leds = || values(|kind| kind == "neopixel", "pin");
     let on_line = |pin: String| Some((serial_of(&config, &pin)?, pin));
     let pins = config.sections().iter().flat_map(pins).filter(|pin| line_of(name_of(pin)).is_some());
-    Some(Printer {
+    Ok(Printer {
         serials: values(|kind| kind == "mcu", "serial").map(Into::into).collect(),
         leds: leds().filter(is_spi).collect(),
         line_leds: leds().filter(|pin| !is_spi(pin)).filter_map(on_line).collect(),
@@ -91,7 +94,7 @@ pub fn printer_cfg(bytes: &[u8]) {
     for (text, name) in bytes.split(|byte| *byte == 0).zip(names) {
         std::fs::write(folder.join(name), text).expect("a file");
     }
-    if let Some(printer) = read(&Computer::at(&folder), Path::new("/printer.cfg")) {
+    if let Ok(printer) = read(&Computer::at(&folder), Path::new("/printer.cfg")) {
         assert!(printer.leds.iter().all(|pin| pin.contains("spidev")));
     }
 }
@@ -104,7 +107,7 @@ mod tests {
     const CONFIG: &str = "/home/pi/config/printer.cfg";
 
     fn serials(tree: &Tree) -> Option<Vec<String>> {
-        let printer = read(&tree.computer(), Path::new(CONFIG))?;
+        let printer = read(&tree.computer(), Path::new(CONFIG)).ok()?;
         Some(printer.serials.iter().map(|path| path.display().to_string()).collect())
     }
 

@@ -138,7 +138,7 @@ fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Fin
 
 /// The finding if the configurations of several klippys name one link.
 fn wanted_by_several(path: &Path, opening: &[&Klippy]) -> Option<Finding> {
-    let sure: Vec<&Klippy> = opening.iter().copied().filter(|klippy| klippy.printer.is_some()).collect();
+    let sure: Vec<&Klippy> = opening.iter().copied().filter(|klippy| klippy.printer().is_some()).collect();
     let shown = path.display();
     let found = format!("more than one klippy's configuration names {shown}{}, and one can have it", by(&sure));
     let remedy = "another serial for one of them: an instance of its own (man pinion-mcu.service)";

@@ -86,7 +86,7 @@ pub enum Direction {
 
 /// Lines whose levels one store can change together. A claimed line says if it is in one ([`Line::bank`]).
 pub trait Bank: Sync {
-    /// Drives the lines of these bits: first those of `high`, then those of `low`.
+    /// Drives the lines of the bits in `high` to high, then the lines of the bits in `low` to low.
     fn change(&self, high: u32, low: u32);
 
     /// Returns when the changes have reached the lines ([`Line::flush`]).
@@ -432,7 +432,7 @@ impl ChipSelect {
         self.line.write(selected == self.active_high)
     }
 
-    /// Selects the chip for at least 1 us, without clock edges meanwhile.
+    /// Selects the chip for at least 1 us. The clock has no edge in that time.
     ///
     /// # Errors
     ///
@@ -476,7 +476,7 @@ pub trait Board: Send {
     }
 
     /// Another view of the same hardware, for a thread that [looks again](Board::look_again). This board then also has
-    /// what the view finds. `None` if nothing comes or goes.
+    /// the devices that the view finds. `None` if no device comes or goes.
     fn view(&self) -> Option<Box<dyn Board>> {
         None
     }

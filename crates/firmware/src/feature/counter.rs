@@ -14,8 +14,8 @@ use std::sync::Arc;
 
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, InputLine, Job, JobSlot, Look, Next, Object,
-    Oid, Response, Timer, WireClock, command, response,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, InputLine, Job, JobSlot, Next, Object, Oid,
+    Response, Sample, Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -188,7 +188,7 @@ struct Counter {
 
 impl Counter {
     /// Processes the level at a given time.
-    fn look(&mut self, context: &mut Context, level: bool, at: Clock) {
+    fn sample(&mut self, context: &mut Context, level: bool, at: Clock) {
         if level != (self.count % 2 == 1) {
             self.count = self.count.wrapping_add(1);
             self.count_clock = at;
@@ -252,7 +252,7 @@ impl Object for Counter {
             self.pin.awaited(context)?;
         } else {
             match self.pin.read(context)? {
-                Some(level) => self.look(context, level, at),
+                Some(level) => self.sample(context, level, at),
                 None => self.counts = true,
             }
         }
@@ -267,11 +267,11 @@ impl Object for Counter {
             let edges = result.map_err(Shutdown::clone);
             return self.has_read(context, edges, ended);
         }
-        let Some(look) = self.pin.sampled(context, finished) else { return Ok(()) };
-        let Look { level, ended, .. } = look?;
+        let Some(sample) = self.pin.sampled(context, finished) else { return Ok(()) };
+        let Sample { level, ended, .. } = sample?;
         if std::mem::take(&mut self.counts) {
             // A pin that could not be read keeps its last level.
-            self.look(context, level.unwrap_or(self.count % 2 == 1), ended);
+            self.sample(context, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
     }

@@ -120,7 +120,7 @@ impl Wire {
         Ok(())
     }
 
-    /// Drives the line low, whatever level it had.
+    /// Drives the line low from any level.
     pub(super) fn idle(&mut self) -> Result<(), Shutdown> {
         self.level = false;
         self.line.write(false)

@@ -47,9 +47,9 @@ const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 const TIMER: Timer = Timer::sampling(0);
 
 /// One reading.
-struct Look;
+struct Read;
 
-impl Job for Look {
+impl Job for Read {
     type Device = dyn Thermometer;
     type Out = i32;
     type Failure = Trouble;
@@ -61,7 +61,7 @@ impl Job for Look {
 
 struct Ds18b20 {
     thermometer: DeviceId<dyn Thermometer>,
-    look: JobSlot<Look>,
+    read: JobSlot<Read>,
     /// When the reading under way was requested.
     asked: Clock,
     /// When the next reading is due.
@@ -102,10 +102,10 @@ impl Object for Ds18b20 {
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
-        if self.look.is_here() {
+        if self.read.is_here() {
             self.asked = at;
             self.next_clock = next;
-            self.look.send(context, self.thermometer)?;
+            self.read.send(context, self.thermometer)?;
         } else if at.since(self.asked) > READ_LIMIT {
             context.try_shut_down(Shutdown::because(
                 TOO_SLOW,
@@ -117,7 +117,7 @@ impl Object for Ds18b20 {
     }
 
     fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
-        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
+        let Some(Back { result, is_wanted: true, .. }) = self.read.back(finished) else { return Ok(()) };
         match result {
             Ok(value) => {
                 self.value = value;
@@ -143,7 +143,7 @@ impl Object for Ds18b20 {
     }
 
     fn shutdown(&mut self, _context: &mut Context) {
-        self.look.drop_pending();
+        self.read.drop_pending();
     }
 }
 
@@ -163,7 +163,7 @@ fn configure(
     let thermometer = context.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {
         thermometer: context.reader(thermometer)?,
-        look: JobSlot::new(Look),
+        read: JobSlot::new(Read),
         asked: Clock::EPOCH,
         next_clock: Clock::EPOCH,
         rest_ticks: Ticks(0),
@@ -197,7 +197,7 @@ const QUERY_DS18B20: Command = command!(
     |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
         let at = context.instant(clock);
         context.cancel(TIMER);
-        sensor.look.drop_pending();
+        sensor.read.drop_pending();
         if rest_ticks == Ticks(0) {
             return Ok(());
         }

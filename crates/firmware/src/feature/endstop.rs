@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Context, Feature, Finished, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, UNREAD_LIMIT,
+    Command, Context, Feature, Finished, Hold, InputLine, Next, Object, Oid, Response, Sample, Timer, UNREAD_LIMIT,
     WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
@@ -35,7 +35,7 @@ struct Endstop {
     homing: Option<Homing>,
     /// When sampling continues if the samples after the last match do not confirm it.
     next_wake: Clock,
-    /// Due time of the sample that the chip's worker is taking. Meanwhile the timer watches that it does not take too
+    /// Due time of the sample that the chip's worker is taking. The timer checks until then that it does not take too
     /// long. `None`: the worker takes none.
     due: Option<Clock>,
     /// A query also waits for the worker to read the line. Further commands wait with it.
@@ -66,7 +66,7 @@ impl Endstop {
         }
     }
 
-    /// Decides what comes next. The sample was due at `at` and taken at `seen`.
+    /// Decides on the next sample or the trigger. The sample was due at `at` and taken at `seen`.
     fn judge(&mut self, context: &mut Context, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
@@ -129,9 +129,9 @@ impl Object for Endstop {
     /// The chip's worker has read the line.
     fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
         let is_homing = self.due.is_some();
-        let look = if is_homing { self.pin.seen(context, finished) } else { self.pin.sampled(context, finished) };
-        let Some(look) = look else { return Ok(()) };
-        let Look { level, began, ended } = look?;
+        let sample = if is_homing { self.pin.seen(context, finished) } else { self.pin.sampled(context, finished) };
+        let Some(sample) = sample else { return Ok(()) };
+        let Sample { level, began, ended } = sample?;
         match level {
             // A query needs a level, so the line is read again.
             None if self.asked.is_some() && !context.is_shutdown() => self.pin.read(context).map(drop)?,

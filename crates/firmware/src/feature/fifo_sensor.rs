@@ -2,10 +2,10 @@
 //! Accelerometers that measure at their own pace into a FIFO. This is the shared code of ADXL345, LIS2DW, MPU9250,
 //! ICM20948 and BMI160. Each [`FifoChip`] has the differences.
 //!
-//! A reading takes the samples that are there, at most those of one message. So other devices on the bus get their
-//! turn. If the chip has more, the next reading follows at once, otherwise after `rest_ticks`. For hosts up to v0.12
-//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all jobs of a bus in order,
-//! and returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
+//! A reading takes the samples that are there, at most as many as fit in a message. So other devices on the bus get
+//! their turn. If the chip has more, the next reading follows at once, otherwise after `rest_ticks`. For hosts up to
+//! v0.12 the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all jobs of a bus in order, and
+//! returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
 #![forbid(unsafe_code)]
 
@@ -348,7 +348,7 @@ impl<C: FifoChip> FifoSensor<C> {
         self.phase = Phase::Idle;
     }
 
-    /// Notes how many bytes the chip has. A reading under way knows better and is left alone.
+    /// Notes how many bytes the chip has. A reading under way has a newer count, and keeps it.
     fn has_pending(&mut self, bytes: u16) {
         if let Some(read) = self.read.here() {
             read.reading.pending = bytes;
@@ -361,7 +361,7 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     fn switch(&mut self, context: &mut Context, on: bool) -> Result<(), Shutdown> {
-        // A switch is under way. `switched` then does what is wanted by that time.
+        // A switch is under way. At its end `switched` compares the sensor's state with the wanted one.
         let Some(switch) = self.switch.here() else { return Ok(()) };
         switch.on = on;
         self.switch.send_to(context, self.device)

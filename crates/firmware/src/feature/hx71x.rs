@@ -217,7 +217,7 @@ fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, s
         };
         let way = context.device(&bus, Box::new(Way::Spi(Waves::new(device, pulses, sclk))))?;
         let chip = Hx71x::new(way, gain_channel, None);
-        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, Read::default()));
+        return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::POLL, Read::default()));
     }
     let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! I2C devices.
 //!
-//! `i2c_transfer` answers with the status of the bus, and klippy decides what to do. The older `i2c_read`, `i2c_write`
+//! `i2c_transfer` answers with the status of the bus, and klippy decides. The older `i2c_read`, `i2c_write`
 //! and `i2c_modify_bits` have no status: a failure stops the MCU. A transfer is finished and answered before the next
 //! command runs, because klippy configures chips with one transfer after the other. A plain read is retried
 //! ([`BusDevice::read_register`](crate::board::BusDevice::read_register)). A transfer that writes is not.
@@ -303,7 +303,7 @@ const I2C_SET_BUS: Command = command!(
 )
 .of(since(V0_12));
 
-/// Half a period at 100 kHz. Klipper's C used this rate whatever rate it was given.
+/// Half a period at 100 kHz. Klipper's C used this rate for every requested rate.
 const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
 
 const I2C_SET_SOFTWARE_BUS: Command = command!(

@@ -99,12 +99,12 @@ fn is_ready(chip: &mut dyn BusDevice) -> Result<bool, BusError> {
 }
 
 /// Reads a sample, if there is one.
-struct Look {
+struct Read {
     /// The error for the host if the bus fails now.
     error: u8,
 }
 
-impl Job for Look {
+impl Job for Read {
     type Device = Chip;
     /// Both words of channel 0.
     type Out = Option<u32>;
@@ -176,14 +176,14 @@ impl Homing {
 const KIND: &str = "LDC1612";
 
 // The numbers of the jobs.
-const LOOK: u8 = 0;
+const READ: u8 = 0;
 const ASK: u8 = 1;
 
 struct Ldc1612 {
     i2c: Oid,
     /// Low while a sample is ready.
     intb: Option<Arc<dyn Line>>,
-    look: JobSlot<Look>,
+    read: JobSlot<Read>,
     /// Turns of the timer that came during a reading.
     missed: u16,
     ask: JobSlot<Ask>,
@@ -203,7 +203,7 @@ impl Ldc1612 {
         let sensor = Ldc1612 {
             i2c,
             intb,
-            look: JobSlot::numbered(LOOK, Look { error: I2C_STATUS_ERROR }),
+            read: JobSlot::numbered(READ, Read { error: I2C_STATUS_ERROR }),
             missed: 0,
             ask: JobSlot::numbered(ASK, Ask),
             rest_ticks: Ticks(0),
@@ -232,11 +232,11 @@ impl Ldc1612 {
     }
 
     /// Makes the worker read the sensor, if it may have a sample.
-    fn look(&mut self, context: &mut Context) -> Result<(), Shutdown> {
+    fn read(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
             return Ok(());
         }
-        self.look.send_to(context, self.i2c)
+        self.read.send_to(context, self.i2c)
     }
 
     /// Makes up for the turns that came while the sensor was read. Klipper's timer waits for the bus. So the first
@@ -246,8 +246,8 @@ impl Ldc1612 {
         if missed == 0 {
             return Ok(());
         }
-        self.look(context)?;
-        if self.look.is_pending() {
+        self.read(context)?;
+        if self.read.is_pending() {
             self.bulk.count_overflows(missed - 1);
         }
         Ok(())
@@ -283,7 +283,7 @@ impl Ldc1612 {
         };
         let now = context.now();
         // A sample that is being read counts as one in the chip.
-        let ready = self.look.is_pending() || !intb.read()?;
+        let ready = self.read.is_pending() || !intb.read()?;
         self.bulk.send_status(context, (now, now), if ready { SAMPLE_BYTES } else { 0 });
         Ok(())
     }
@@ -295,8 +295,8 @@ impl Object for Ldc1612 {
     }
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        if self.look.is_here() {
-            self.look(context)?;
+        if self.read.is_here() {
+            self.read(context)?;
         } else {
             self.missed = self.missed.saturating_add(1);
         }
@@ -304,13 +304,13 @@ impl Object for Ldc1612 {
     }
 
     fn finished(&mut self, context: &mut Context, number: u8, finished: Finished) -> Result<(), Shutdown> {
-        if number == LOOK {
-            let Some(Back { result, is_wanted, ended, .. }) = self.look.back(finished) else { return Ok(()) };
+        if number == READ {
+            let Some(Back { result, is_wanted, ended, .. }) = self.read.back(finished) else { return Ok(()) };
             let read = result.ok();
             Self::note(&mut self.failing, context, result.err())?;
             let words = match read {
                 Some(words) => words.map(Ok),
-                None => self.look.here().map(|look| Err(look.error)),
+                None => self.read.here().map(|read| Err(read.error)),
             };
             if let (true, Some(words)) = (is_wanted, words) {
                 self.add(context, words, ended)?;
@@ -326,7 +326,7 @@ impl Object for Ldc1612 {
     }
 
     fn shutdown(&mut self, _context: &mut Context) {
-        self.look.drop_pending();
+        self.read.drop_pending();
         self.missed = 0;
     }
 }
@@ -376,7 +376,7 @@ const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid
 const QUERY_LDC1612: Command =
     command!("query_ldc1612 oid=%c rest_ticks=%u", Ldc1612, |sensor, context, rest_ticks: Ticks| {
         context.cancel(TIMER);
-        sensor.look.drop_pending();
+        sensor.read.drop_pending();
         sensor.missed = 0;
         if rest_ticks == Ticks(0) {
             return Ok(());

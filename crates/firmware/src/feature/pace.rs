@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The time of a job that drives lines itself, with a few microseconds between two edges.
 //!
-//! Where Klipper's C waits in a loop, or has a timer for each bit, a worker waits in a loop here. Meanwhile the core
-//! is free, and nothing has to wake up between two edges.
+//! Where Klipper's C waits in a loop, or has a timer for each bit, a worker waits in a loop here. So the core is
+//! free, and nothing has to wake up between two edges.
 
 #![forbid(unsafe_code)]
 

@@ -29,7 +29,7 @@ const READING: u8 = 0;
 /// The result of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sample {
-    /// There was none: the worker only looked.
+    /// There was none: the worker only polled.
     NotReady,
     /// A value.
     Value(i32),
@@ -95,12 +95,12 @@ pub(super) enum Ready {
     /// This line is low.
     Line(Arc<dyn Line>),
     /// The worker polls. `waits` counts the `rest_ticks` since the poll began. `fresh`: it has just read a sample.
-    Look { waits: u32, fresh: bool },
+    Poll { waits: u32, fresh: bool },
 }
 
 impl Ready {
     /// The worker polls.
-    pub(super) const LOOK: Ready = Ready::Look { waits: 0, fresh: false };
+    pub(super) const POLL: Ready = Ready::Poll { waits: 0, fresh: false };
 }
 
 /// How many `rest_ticks` the timer leaves the chip alone after it has begun to read a sample.
@@ -137,7 +137,7 @@ impl<C: ReadyChip> ReadyAdc<C> {
     fn restart(&mut self) {
         self.reading.drop_pending();
         self.late = false;
-        if let Ready::Look { fresh, .. } = &mut self.ready {
+        if let Ready::Poll { fresh, .. } = &mut self.ready {
             *fresh = false;
         }
     }
@@ -163,7 +163,7 @@ impl<C: ReadyChip> ReadyAdc<C> {
         let now = context.now();
         let ready = match &self.ready {
             Ready::Line(line) => self.reading.is_pending() || !line.read()?,
-            Ready::Look { .. } => false,
+            Ready::Poll { .. } => false,
         };
         let bytes = (self.chip.channels() * VALUE_BYTES) as u32;
         self.bulk.send_status(context, (now, now), if ready { bytes } else { 0 });
@@ -182,16 +182,16 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
             Ready::Line(_) if is_pending => (false, 4),
             Ready::Line(line) if line.read()? => (false, 1),
             Ready::Line(_) => (true, READING_RESTS),
-            Ready::Look { waits, .. } if is_pending => {
+            Ready::Poll { waits, .. } if is_pending => {
                 *waits += 1;
                 (false, if *waits < READING_RESTS { 1 } else { 4 })
             }
             // The next poll begins 8 `rest_ticks` after the one that read a sample.
-            Ready::Look { waits, fresh } if *fresh && *waits + 1 < READING_RESTS => {
+            Ready::Poll { waits, fresh } if *fresh && *waits + 1 < READING_RESTS => {
                 *fresh = false;
                 (false, READING_RESTS - 1 - *waits)
             }
-            Ready::Look { waits, .. } => {
+            Ready::Poll { waits, .. } => {
                 *waits = 0;
                 (true, 1)
             }
@@ -231,7 +231,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
             values.len() * VALUE_BYTES
         };
         let sample = self.chip.sample(answer, self.late);
-        if let Ready::Look { fresh, .. } = &mut self.ready {
+        if let Ready::Poll { fresh, .. } = &mut self.ready {
             *fresh = sample != Sample::NotReady;
         }
         let len = match sample {

@@ -2,7 +2,7 @@
 //! Filters of second-order sections in fixed point, for the samples of a sensor that triggers.
 //!
 //! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals
-//! that of Klipper's C to the bit, even if its 32-bit sums wrap.
+//! the result of Klipper's C to the bit, even if its 32-bit sums wrap.
 
 #![forbid(unsafe_code)]
 

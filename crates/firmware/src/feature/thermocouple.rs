@@ -121,9 +121,9 @@ fn types(_board: &dyn Board) -> Vec<Range> {
 }
 
 /// One reading of the chip.
-struct Look(Chip);
+struct Read(Chip);
 
-impl Job for Look {
+impl Job for Read {
     type Device = dyn BusDevice;
     /// The word, and the fault bits.
     type Out = (u32, u8);
@@ -147,7 +147,7 @@ impl Job for Look {
 struct Thermocouple {
     spi: Oid,
     chip: Chip,
-    look: JobSlot<Look>,
+    read: JobSlot<Read>,
     rest_ticks: Ticks,
     min_value: u32,
     max_value: u32,
@@ -193,15 +193,15 @@ impl Object for Thermocouple {
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
         // A chip that is still being read misses this one.
-        if self.look.is_here() {
+        if self.read.is_here() {
             self.next_clock = next;
-            self.look.send_to(context, self.spi)?;
+            self.read.send_to(context, self.spi)?;
         }
         Ok(Next::At(next))
     }
 
     fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
-        let Some(Back { result, is_wanted: true, .. }) = self.look.back(finished) else { return Ok(()) };
+        let Some(Back { result, is_wanted: true, .. }) = self.read.back(finished) else { return Ok(()) };
         match result {
             Ok((value, fault)) => {
                 context.send(Reading { oid: context.oid(), next_clock: self.next_clock, value, fault });
@@ -212,7 +212,7 @@ impl Object for Thermocouple {
     }
 
     fn shutdown(&mut self, _context: &mut Context) {
-        self.look.drop_pending();
+        self.read.drop_pending();
     }
 }
 
@@ -227,7 +227,7 @@ const CONFIG_THERMOCOUPLE: Command = command!(
         let object = Thermocouple {
             spi: spi_oid,
             chip,
-            look: JobSlot::new(Look(chip)),
+            read: JobSlot::new(Read(chip)),
             rest_ticks: Ticks(0),
             min_value: 0,
             max_value: 0,
@@ -245,7 +245,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
     |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
         let at = context.instant(clock);
         context.cancel(TIMER);
-        sensor.look.drop_pending();
+        sensor.read.drop_pending();
         if rest_ticks == Ticks(0) {
             return Ok(());
         }

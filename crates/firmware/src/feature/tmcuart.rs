@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The UART of Trinamic's stepper drivers (TMC2208, TMC2209 and similar), on one wire or two. klippy writes the start
-//! and stop bits itself, checks those of the reply, and asks again.
+//! and stop bits itself, checks the reply's, and asks again.
 //!
 //! The pins are GPIO lines (`lines.rs`) or a serial port of the computer (`port.rs`).
 
@@ -47,9 +47,9 @@ const DATA_MAX: usize = 10;
 /// How long the line is quiet between the command and the first edge, as in Klipper's C. A driver wants a quiet line
 /// between messages.
 const QUIET: Ticks = Ticks::from_us(200);
-/// How long to wait after a message before looking for the reply, in bits.
+/// How long to wait after a message before the search for the reply, in bits.
 const TURN_BITS: u32 = 4;
-/// How long to look for the reply, in bits.
+/// Longest search for the reply, in bits.
 const REPLY_BITS: u32 = 65;
 /// Pause of a driver before its reply: 24 bits with klippy's SENDDELAY of 2 (TMC2209 data sheet, section 5.1), and some.
 const REPLY_PAUSE: u32 = 28;
@@ -221,7 +221,7 @@ const CONFIG_TMCUART: Command = command!(
     "config_tmcuart oid=%c rx_pin=%u pull_up=%c tx_pin=%u bit_time=%u",
     |context, oid: Oid, rx_pin: Pin, pull_up: bool, tx_pin: Pin, bit_time: Ticks| {
         context.vacant(oid)?;
-        // The resistors at a port's pins are those of the device tree.
+        // The device tree sets the resistors at a port's pins.
         let (way, wire, pace) = match context.board()?.serial(rx_pin, rate_hz(bit_time))? {
             Some(_) if rx_pin != tx_pin => {
                 let (rx, tx) = (context.name(rx_pin), context.name(tx_pin));

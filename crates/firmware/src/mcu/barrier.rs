@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! One order: commands wait for the jobs that commands began.
 //!
-//! Klipper's C runs a command to its end before it looks at the next one. It acknowledges a block after the block's
+//! Klipper's C runs a command to its end before it reads the next one. It acknowledges a block after the block's
 //! last command. klippy relies on both. So a job that a command sends *holds*: the core runs no further command
 //! until the job is back, and does not acknowledge the block ([`Mcu::is_held`]). Timers go on, and jobs that they
 //! send hold nothing. A stopped MCU is not held.

@@ -101,14 +101,14 @@ impl Config {
     const IS_CONFIG: u64 = 1 << 62;
     const IS_SHUTDOWN: u64 = 1 << 61;
 
-    /// It as a word that is not 0.
+    /// The answer as a word that is not 0.
     pub fn word(&self) -> u64 {
         let flag = |is_set, bit| if is_set { bit } else { 0 };
         let flags = Self::KNOWN | flag(self.is_config, Self::IS_CONFIG) | flag(self.is_shutdown, Self::IS_SHUTDOWN);
         flags | u64::from(self.move_count) << 32 | u64::from(self.crc)
     }
 
-    /// The answer that [`Config::word`] made this word of.
+    /// The answer from which [`Config::word`] made this word.
     pub fn of_word(word: u64) -> Option<Config> {
         (word & Self::KNOWN != 0).then_some(Config {
             is_config: word & Self::IS_CONFIG != 0,

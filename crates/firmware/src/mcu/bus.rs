@@ -21,7 +21,7 @@ pub struct Bus {
     calls: Calls,
 }
 
-/// A chip that counts its transfers and retries the ones that may be repeated.
+/// A chip that counts its transfers and retries the repeatable ones.
 struct Counted {
     device: Box<dyn BusDevice>,
     calls: Calls,

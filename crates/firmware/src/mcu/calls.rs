@@ -3,8 +3,8 @@
 //!
 //! A bus fails now and then. A spike on a long cable is no reason to stop a print. There are two limits:
 //!
-//! - A worker repeats a failed call at once, up to [`TRIES`] tries in all. It does so only if the repetition cannot
-//!   change what the call does: reading a register or a level, setting an output.
+//! - A worker repeats a failed call at once, up to [`TRIES`] tries in all. It does so only if a second call
+//!   has the same effect as one: reading a register or a level, setting an output.
 //! - A sampled input may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that stops a move has
 //!   no limit: its failure stops the MCU at once.
 

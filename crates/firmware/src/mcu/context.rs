@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The context of a call to a feature: what the feature may do.
+//! The context of a call to a feature: the operations that the feature may use.
 
 #![forbid(unsafe_code)]
 
@@ -76,8 +76,8 @@ impl<'a> Context<'a> {
         self.state.scheduler.last_read()
     }
 
-    /// Spins until `end`, for [`SPIN_MAX`](super::SPIN_MAX) at most. No other timer or command runs meanwhile. So use
-    /// it only for spans as short as a step's pulse.
+    /// Spins until `end`, for [`SPIN_MAX`](super::SPIN_MAX) at most. No other timer or command runs in that time. So
+    /// use it only for spans as short as a step's pulse.
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
         self.state.scheduler.spin_until(end);

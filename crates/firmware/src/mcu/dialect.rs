@@ -104,7 +104,7 @@ impl<T> Choice<T> {
     }
 }
 
-/// The features of an MCU, and what its dictionary says about the program.
+/// The features of an MCU, and the facts about the program in its dictionary.
 pub struct Firmware {
     /// The features. The MCU's own feature comes first.
     pub features: &'static [Feature],

@@ -33,7 +33,7 @@ use DialectName::{Kalico, Master, Union, V0_11, V0_12, V0_13};
 impl DialectName {
     /// All of them.
     pub const ALL: [DialectName; 6] = [V0_11, V0_12, V0_13, Master, Kalico, Union];
-    /// Those of known hosts, the oldest first.
+    /// The dialects of known hosts, the oldest first.
     pub const OF_HOSTS: [DialectName; 5] = [V0_11, V0_12, V0_13, Master, Kalico];
 
     /// Its name on the command line, in the log and in the documents.
@@ -60,7 +60,7 @@ impl DialectName {
         }
     }
 
-    /// The dialects of hosts that it is made of. The first one that has a message decides its form. Behavior that no
+    /// The dialects whose messages it has. The first one that has a message decides its form. Behavior that no
     /// form decides is the first one's.
     pub(super) fn parts(&self) -> &[DialectName] {
         match self {
@@ -93,7 +93,7 @@ impl fmt::Display for DialectName {
     }
 }
 
-/// A set of dialects of hosts: the ones that have a form of a message.
+/// A set of dialects of hosts, for example the dialects that have a form of a message.
 ///
 /// A new dialect is in every set that its parent is in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

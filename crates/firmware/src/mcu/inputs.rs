@@ -9,7 +9,8 @@ use crate::board::{Line, Pin};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::lines::{Claim, Level, Repeated};
+use super::claims::Claim;
+use super::level::{Level, Repeated};
 use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
 
 /// Reads an input of a chip that may sleep.
@@ -25,11 +26,11 @@ impl Job for Read {
     }
 }
 
-/// The result of a worker's look at an input.
-pub struct Look {
-    /// `None` if the look failed.
+/// A worker's sample of an input.
+pub struct Sample {
+    /// `None` if the read failed.
     pub level: Option<bool>,
-    /// When the worker began to look.
+    /// When the worker began to read.
     pub began: Clock,
     /// When the worker finished.
     pub ended: Clock,
@@ -44,7 +45,7 @@ pub struct InputLine {
 
 enum Sensor {
     Prompt(Arc<dyn Line>),
-    Slow { line: DeviceId<Repeated>, look: JobSlot<Read>, unread: Unread },
+    Slow { line: DeviceId<Repeated>, read: JobSlot<Read>, unread: Unread },
 }
 
 impl InputLine {
@@ -52,12 +53,12 @@ impl InputLine {
     pub(super) fn new(number: u8, claim: &Claim) -> InputLine {
         let sensor = match claim.slow() {
             None => Sensor::Prompt(claim.line()),
-            Some(line) => Sensor::Slow { line, look: JobSlot::numbered(number, Read), unread: Unread::default() },
+            Some(line) => Sensor::Slow { line, read: JobSlot::numbered(number, Read), unread: Unread::default() },
         };
         InputLine { pin: claim.pin(), sensor, level: claim.level() }
     }
 
-    /// The line's level. `None` if the chip's worker has to look: the level then comes later, to the object's
+    /// The line's level. `None` if the chip's worker has to read it: the level then comes later, to the object's
     /// `finished`.
     ///
     /// # Errors
@@ -65,16 +66,16 @@ impl InputLine {
     /// "GPIO line read failed".
     #[inline]
     pub fn read(&mut self, context: &mut Context) -> Result<Option<bool>, Shutdown> {
-        if let Sensor::Slow { line, look, unread } = &mut self.sensor
-            && look.is_here()
+        if let Sensor::Slow { line, read, unread } = &mut self.sensor
+            && read.is_here()
         {
             unread.asked(context.now());
-            look.send(context, *line)?;
+            read.send(context, *line)?;
         }
         self.prompt_level()
     }
 
-    /// The line's level; `None` if the chip's worker would have to look.
+    /// The line's level; `None` if the chip's worker would have to read it.
     ///
     /// # Errors
     ///
@@ -87,25 +88,25 @@ impl InputLine {
         }
     }
 
-    /// Whether the chip's worker is looking at the line.
+    /// Whether the chip's worker is reading the line.
     pub fn is_looking(&self) -> bool {
-        matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
+        matches!(&self.sensor, Sensor::Slow { read, .. } if !read.is_here())
     }
 
-    /// Handles a finished look. It fails with "GPIO line read failed" when no look has
+    /// Handles a finished read. It fails with "GPIO line read failed" when no read has
     /// succeeded for [`UNREAD_LIMIT`].
-    pub fn sampled(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+    pub fn sampled(&mut self, context: &Context, finished: Finished) -> Option<Result<Sample, Shutdown>> {
         self.take_in(context, finished, false)
     }
 
-    /// The same, if a move depends on the input. One failed look is a failure at once.
-    pub fn seen(&mut self, context: &Context, finished: Finished) -> Option<Result<Look, Shutdown>> {
+    /// The same, if a move depends on the input. One failed read is a failure at once.
+    pub fn seen(&mut self, context: &Context, finished: Finished) -> Option<Result<Sample, Shutdown>> {
         self.take_in(context, finished, true)
     }
 
-    fn take_in(&mut self, context: &Context, finished: Finished, at_once: bool) -> Option<Result<Look, Shutdown>> {
-        let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
-        let Back { result, began, ended, .. } = look.back(finished)?;
+    fn take_in(&mut self, context: &Context, finished: Finished, at_once: bool) -> Option<Result<Sample, Shutdown>> {
+        let Sensor::Slow { read, unread, .. } = &mut self.sensor else { return None };
+        let Back { result, began, ended, .. } = read.back(finished)?;
         let level = match result {
             Ok(level) => {
                 unread.read();
@@ -117,17 +118,17 @@ impl InputLine {
             }
             Err(_) => Ok(None),
         };
-        Some(level.map(|level| Look { level, began, ended }))
+        Some(level.map(|level| Sample { level, began, ended }))
     }
 
-    /// Checks a look that may still be on its way. Call this while one may be.
+    /// Checks a read that may still be on its way. Call this while one may be.
     ///
     /// # Errors
     ///
-    /// "GPIO line read failed" when no look has succeeded for [`UNREAD_LIMIT`].
+    /// "GPIO line read failed" when no read has succeeded for [`UNREAD_LIMIT`].
     pub fn awaited(&self, context: &mut Context) -> Result<(), Shutdown> {
-        let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
-        if look.is_here() || !unread.is_too_long(context.now()) {
+        let Sensor::Slow { read, unread, .. } = &self.sensor else { return Ok(()) };
+        if read.is_here() || !unread.is_too_long(context.now()) {
             return Ok(());
         }
         let (name, ms) = (context.name(self.pin), UNREAD_LIMIT.as_ms());

@@ -11,7 +11,7 @@ use crate::time::Clock;
 
 use super::{Batch, Bus, BusCounts, Chip, Context, DeviceId, Finished, Mcu, Oid, Report, State, Timer};
 
-/// The result of an event: what happens to its timer.
+/// The result of an event: when its timer runs next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
     /// The timer runs again at this time.

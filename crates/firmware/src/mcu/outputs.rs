@@ -9,40 +9,10 @@ use std::sync::Arc;
 use crate::board::Line;
 use crate::shutdown::Shutdown;
 
-use super::lines::{Claim, Level, Repeated};
+use super::claims::Claim;
+use super::level::Level;
 use super::stop::Subject;
-use super::{Batch, Context, DeviceId, Finished, Oid, Remote, Safe, State};
-
-/// An output of an object.
-pub(super) struct Output {
-    /// The object. It names the output in the log.
-    owner: Oid,
-    /// Whether a stop of the MCU leaves its level.
-    is_kept: bool,
-    /// Writes the line, if its chip may be slow. `None` also while it runs.
-    writer: Option<Remote<Repeated>>,
-}
-
-impl Output {
-    pub(super) fn of(owner: Oid, is_kept: bool) -> Output {
-        Output { owner, is_kept, writer: None }
-    }
-
-    /// Whether a stop of the MCU drives it to its shutdown value.
-    pub(super) fn is_driven_at_stop(&self) -> bool {
-        !self.is_kept
-    }
-
-    /// The same line's output from now on. A write of the earlier one may be on its way.
-    pub(super) fn taking_over(self, earlier: Option<Output>) -> Output {
-        Output { writer: self.writer.or(earlier.and_then(|earlier| earlier.writer)), ..self }
-    }
-
-    /// Lets a worker write the line, which is at `level`.
-    pub(super) fn give_writer(&mut self, place: usize, line: DeviceId<Repeated>, level: bool) {
-        self.writer.get_or_insert_with(|| Remote::of_output(place, line, level));
-    }
-}
+use super::{Batch, Context, Finished, Safe, State};
 
 /// An output line of any chip.
 pub struct OutputLine {
@@ -145,16 +115,6 @@ impl State {
         self.with_writer(place, |writer, context| writer.set(context, level)).unwrap_or(Ok(()))
     }
 
-    fn with_writer<R>(&mut self, place: usize, f: impl FnOnce(&mut Remote<Repeated>, &mut Context) -> R) -> Option<R> {
-        let output = self.lines.output_mut(place)?;
-        let (owner, mut writer) = (output.owner, output.writer.take()?);
-        let result = f(&mut writer, &mut Context::new(self, owner));
-        if let Some(output) = self.lines.output_mut(place) {
-            output.writer = Some(writer);
-        }
-        Some(result)
-    }
-
     /// A worker has written an output.
     pub(super) fn output_written(&mut self, place: usize, finished: Finished) -> Result<(), Shutdown> {
         match self.with_writer(place, |writer, context| writer.back(context, finished)).flatten() {
@@ -174,10 +134,5 @@ impl State {
             Some(_) => self.write_output(place, value).map(|()| Safe::Later),
         };
         self.note_safety(Subject::Output(place), true, safe);
-    }
-
-    /// The object that an output belongs to.
-    pub(super) fn owner(&self, place: usize) -> Oid {
-        self.lines.get(place).and_then(Claim::output).map_or(Oid::NONE, |output| output.owner)
     }
 }

@@ -13,14 +13,14 @@ use super::stats::Stats;
 use super::timers::Timers;
 use super::{Context, Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
 
-/// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
+/// Longest wait within a timer's event. Nothing else runs in that time, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
 /// How many timers run before the MCU checks the delay and commands get a turn (`TIMER_REPEAT_COUNT` of Klipper's
 /// linux/timer.c).
 const REPEAT_COUNT: u32 = 20;
 /// The same after a turn without a command to run (`TIMER_IDLE_REPEAT_COUNT`).
 const IDLE_REPEAT_COUNT: u32 = 100;
-/// How many edges may follow each other without a look at the clock. A look takes a tenth of an edge's time.
+/// How many edges may follow each other without a read of the clock. A read takes a tenth of an edge's time.
 const UNTIMED_MAX: u32 = 4;
 /// The time between two `stats` responses.
 const STATS_TICKS: Ticks = Ticks::from_ms(5000);
@@ -111,8 +111,8 @@ impl Scheduler {
         self.last_read = now;
     }
 
-    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile. So use it only for spans
-    /// as short as a step's pulse.
+    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs in that time. So use it only for
+    /// spans as short as a step's pulse.
     #[inline]
     pub(super) fn spin_until(&mut self, end: Clock) {
         if self.last_read < end {

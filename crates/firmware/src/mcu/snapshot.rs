@@ -218,7 +218,7 @@ impl fmt::Write for Room<'_> {
 
 impl Mcu {
     /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
-    /// begins again if lines or objects came or went meanwhile. It does not allocate.
+    /// begins again if lines or objects came or went since its head. It does not allocate.
     pub fn fill(&self, to: &mut Snapshot) -> bool {
         let State { lines, objects, workers, .. } = &self.state;
         let shape = (lines.len(), objects.len());

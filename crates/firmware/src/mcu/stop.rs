@@ -30,7 +30,7 @@ const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 /// The pending shutdown values.
 #[derive(Default)]
 pub(super) struct PendingValues {
-    /// Whether `shut_down` is running. A failure meanwhile must not start it again.
+    /// Whether `shut_down` is running. A failure within it must not start it again.
     under_way: bool,
     values: Vec<PendingValue>,
 }

@@ -62,7 +62,7 @@ impl TimerId {
         self.timer.0 & Timer::EXACT != 0
     }
 
-    /// The object whose timer it is; [`Oid::NONE`] for the MCU's own timers.
+    /// The object that has the timer; [`Oid::NONE`] for the MCU's own timers.
     pub(super) const fn oid(self) -> Oid {
         self.oid
     }

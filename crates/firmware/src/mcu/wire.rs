@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// The wire that a host reaches the MCU by.
+/// The wire between a host and the MCU.
 #[derive(Clone, Debug, Default)]
 pub enum Wire {
     /// A pseudo terminal, or any other wire without a rate of its own.

@@ -7,12 +7,8 @@ use pinion_printer_config::{Section, Trouble};
 use pinion_sim::{Tmc2209Config, Tmc5160Config};
 
 use super::description::Entry;
+use super::known::motor_of;
 use super::translate::Translator;
-
-/// The name of the section of a driver's motor.
-pub(super) fn motor_of(driver: &Section) -> &str {
-    driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
-}
 
 impl Translator<'_> {
     pub(super) fn drivers(&mut self) -> Result<(), Trouble> {

@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+use pinion_printer_config::Section;
+
 /// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
@@ -159,4 +161,9 @@ pub(crate) fn kind_of(word: &str) -> Kind {
         "tmc2130" | "tmc2208" | "tmc2209" | "tmc2240" | "tmc2660" | "tmc5160" => Kind::Known,
         _ => Kind::Strange,
     }
+}
+
+/// The name of the section of a driver's motor.
+pub(super) fn motor_of(driver: &Section) -> &str {
+    driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
 }

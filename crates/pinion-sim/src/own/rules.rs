@@ -7,8 +7,7 @@
 use pinion_printer_config::pins::{MAIN, Pin};
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
-use super::drivers::motor_of;
-use super::known::{Kind, kind_of};
+use super::known::{Kind, kind_of, motor_of};
 
 /// The value of an option.
 #[derive(Clone, Copy)]

@@ -68,7 +68,7 @@ impl Flow {
         self.0.extend_from_slice(bytes);
     }
 
-    /// Takes in what `input` has, and returns these bytes.
+    /// Takes in the bytes of `input`, and returns them.
     fn fill(&mut self, input: impl FnOnce(&mut [u8]) -> io::Result<Incoming>) -> io::Result<(Incoming, &mut [u8])> {
         let before = self.0.len();
         self.0.resize(before.max(FLOW_BYTES), 0);
@@ -81,7 +81,7 @@ impl Flow {
         Ok((heard?, &mut self.0[before..]))
     }
 
-    /// Writes what `output` has room for.
+    /// Writes as many bytes as `output` has room for.
     fn drain(&mut self, output: impl FnOnce(&[u8]) -> io::Result<usize>) -> io::Result<()> {
         if !self.0.is_empty() {
             let written = output(&self.0)?;

@@ -143,7 +143,7 @@ impl Near {
         self.to_host.drain(|bytes| pty.write(bytes)).map_err(|error| lost_pty(&self.link, error))
     }
 
-    /// Waits for something to do, and takes in what has come. True if there is a signal.
+    /// Waits for something to do, and takes in the bytes that have come. True if there is a signal.
     fn wait(&mut self, signal: BorrowedFd<'_>) -> Result<bool, Trouble> {
         let flag = |is_wanted: bool, flag| if is_wanted { flag } else { PollFlags::empty() };
         let pty = &self.pty;

@@ -30,7 +30,7 @@ impl RoundTrips {
     pub(super) fn sent(&mut self, bytes: &[u8], now: Duration) {
         let RoundTrips { to_mcu, sent, .. } = self;
         to_mcu.find(bytes, |sequence| {
-            // A block that is sent again does not count: its acknowledgement may be that of the first one.
+            // A block that is sent again does not count: the acknowledgement may belong to the first copy.
             if sent.len() == UNACKNOWLEDGED_MAX || sent.iter().any(|(earlier, _)| *earlier == sequence) {
                 sent.clear();
             } else {

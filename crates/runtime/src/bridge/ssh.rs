@@ -37,7 +37,7 @@ const OPTIONS: [&str; 13] = [
     "-o",
     "IPQoS=ef",
 ];
-/// ssh's own exit status for what goes wrong before the command at the other end starts, or with the connection.
+/// ssh's own exit status if the connection fails, or if the command at the other end cannot start.
 const SSH_FAILED: i32 = 255;
 /// A shell's exit status for a command that is not there.
 const NOT_FOUND: i32 = 127;

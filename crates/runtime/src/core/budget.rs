@@ -33,7 +33,7 @@ pub(crate) struct Budget {
     full_fine: i64,
     /// How much the bucket fills in a tick, in 1/1024 ticks.
     share_fine: i64,
-    looked: Clock,
+    checked: Clock,
     /// The time of the next check.
     due: Clock,
     /// The thread's running time at the last check.
@@ -67,7 +67,7 @@ impl Throttle {
 impl Budget {
     /// A full budget for a thread that runs as SCHED_FIFO and has run for `ran` so far. Nine tenths of the kernel's
     /// allowance are the share, and a twentieth is the bucket. The last twentieth is a reserve for time that the kernel
-    /// counts and the looks do not see.
+    /// counts and the checks do not see.
     pub(crate) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
         let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
         let full_fine = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
@@ -76,7 +76,7 @@ impl Budget {
             level_fine: full_fine,
             full_fine,
             share_fine: allowance * 9 / 10,
-            looked: now,
+            checked: now,
             due: now + LOOK,
             ran,
         }
@@ -93,17 +93,17 @@ impl Budget {
         self.level_fine > self.full_fine / 2
     }
 
-    /// Whether it is time to [`Budget::look`].
+    /// Whether it is time to [`Budget::check`].
     #[inline]
     pub(crate) fn is_due(&self, now: Clock) -> bool {
         now >= self.due
     }
 
     /// Takes in the thread's total running time, `ran`. Returns the new class if the thread has to change it.
-    pub(crate) fn look(&mut self, now: Clock, ran: Duration) -> Option<Class> {
-        let span = now.since(self.looked).clamp(0, 1 << 40);
+    pub(crate) fn check(&mut self, now: Clock, ran: Duration) -> Option<Class> {
+        let span = now.since(self.checked).clamp(0, 1 << 40);
         let spent = ran.saturating_sub(self.ran).as_nanos() as i64 / NS_PER_TICK as i64;
-        self.looked = now;
+        self.checked = now;
         self.ran = ran;
         let drain = if self.class == Class::Fifo { spent * FINE } else { 0 };
         self.level_fine = (self.level_fine + span * self.share_fine - drain).min(self.full_fine);
@@ -160,7 +160,7 @@ mod tests {
             if now > seconds * SECOND {
                 break;
             }
-            // The core looks at its budget at least every 100 us while it runs.
+            // The core checks its budget at least every 100 us while it runs.
             let mut left = *run;
             while left > 0 {
                 let slice = left.min(5_000);
@@ -172,7 +172,7 @@ mod tests {
                 left -= slice;
                 if budget.is_due(Clock::from_ticks(now)) {
                     let ran = Duration::from_nanos(ran * NS_PER_TICK);
-                    class = budget.look(Clock::from_ticks(now), ran).unwrap_or(class);
+                    class = budget.check(Clock::from_ticks(now), ran).unwrap_or(class);
                     if class == Class::Other && processors > 1 {
                         budget.moved();
                         class = Class::Fifo;
@@ -215,7 +215,7 @@ mod tests {
                 let runs = if budget.is_ample() { 1000 } else { works };
                 polled += runs - works;
                 ran += runs;
-                let change = budget.look(Clock::from_ticks((ms + 1) * 50_000), Duration::from_micros(ran));
+                let change = budget.check(Clock::from_ticks((ms + 1) * 50_000), Duration::from_micros(ran));
                 assert_eq!(change, None, "{works} after {ms} ms");
                 assert!(budget.level_fine > budget.full_fine / 2 - budget.full_fine / 20);
             }
@@ -227,10 +227,10 @@ mod tests {
     #[test]
     fn a_core_without_budget_is_ordinary_until_half_of_it_is_back() {
         let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
-        let mut look = |ms: u64| budget.look(Clock::from_ticks(ms * SECOND / 1000), Duration::from_secs(1));
-        assert_eq!(look(1000), Some(Class::Other));
+        let mut check = |ms: u64| budget.check(Clock::from_ticks(ms * SECOND / 1000), Duration::from_secs(1));
+        assert_eq!(check(1000), Some(Class::Other));
         // The bucket of 47.5 ms filled by 853 us in each of 1000 ms, so 99 ms are missing. It has to be half full.
-        let back = (1001..2000).find(|ms| look(*ms) == Some(Class::Fifo));
+        let back = (1001..2000).find(|ms| check(*ms) == Some(Class::Fifo));
         assert_eq!(back, Some(1144));
     }
 

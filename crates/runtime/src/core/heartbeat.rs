@@ -8,7 +8,7 @@
 //! Opening a device or ending a worker may then take its time.
 //!
 //! At a shutdown, workers write some of the outputs. Until they have done so, these shutdown values are pending
-//! ([`Heartbeat::set_pending`]). Beats do not count meanwhile. After [`STOPPING`] the guardian takes over, as it does
+//! ([`Heartbeat::set_pending`]). Beats do not count until then. After [`STOPPING`] the guardian takes over, as it does
 //! for a core that hangs.
 //!
 //! The guardian beats each time it listens. With its monitor (`monitors.rs`) the program notices a guardian that is

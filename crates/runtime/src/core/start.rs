@@ -60,20 +60,7 @@ impl CoreThread {
         let parker = Arc::new(Parker::default());
         let (core_progress, core_parker) = (progress.clone(), parker.clone());
         let core = started(thread::Builder::new().name("core".into()).spawn(move || {
-            let CoreThread {
-                board,
-                edges,
-                timing,
-                dialect,
-                wake,
-                heartbeat,
-                snapshots,
-                recording,
-                trace_writer,
-                processors,
-                margin,
-                realtime,
-            } = self;
+            let CoreThread { timing, heartbeat, processors, realtime, snapshots, trace_writer, .. } = self;
             if let Err(error) = processors.confine() {
                 warn!(
                     "--cpu: the core is not bound to its processor, and runs on any: {error}: choose another processor"
@@ -88,11 +75,12 @@ impl CoreThread {
                 }
             });
             let clock = timing.clock.clone();
-            let workers = Threads::new(core_parker.clone(), prepare, clock.clone(), heartbeat, recording, may_poll);
-            let mut mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(response_ring));
-            edges.into_iter().for_each(|edges| mcu.record_edges(edges));
-            let waiter = Waiter::new(clock, core_parker, margin, scheduling, processors);
-            let (requests, progress) = (inbox, core_progress);
+            let workers =
+                Threads::new(core_parker.clone(), prepare, clock.clone(), heartbeat, self.recording, may_poll);
+            let mut mcu = Mcu::new(self.dialect, self.board, timing, Box::new(workers), Box::new(response_ring));
+            self.edges.into_iter().for_each(|edges| mcu.record_edges(edges));
+            let waiter = Waiter::new(clock, core_parker, self.margin, scheduling, processors);
+            let (requests, progress, wake) = (inbox, core_progress, self.wake);
             Core::new(Parts { mcu, requests, waiter, heartbeat, progress, wake, snapshots, trace_writer, may_poll })
                 .run()
         }))?;

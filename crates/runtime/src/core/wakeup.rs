@@ -207,7 +207,7 @@ impl Waiter {
     #[inline]
     pub fn ran(&mut self, now: Clock) {
         let Some(budget) = self.budget.as_mut().filter(|budget| budget.is_due(now)) else { return };
-        match budget.look(now, running_time()) {
+        match budget.check(now, running_time()) {
             Some(Class::Other) if self.processors.change() => budget.moved(),
             Some(class) => realtime::change(class),
             None => {}
@@ -234,7 +234,7 @@ impl Waiter {
     }
 
     /// Waits for `deadline`, or until `called` says that there is something to do. `now` was read a short time ago.
-    /// `called` is asked with the time now. A thread that changes what `called` looks at unparks this thread. `exact` is
+    /// `called` gets the time now. A thread that changes the result of `called` unparks this thread. `exact` is
     /// the deadline or a later one. This thread sleeps until a margin before `exact`, so that it is awake then. From
     /// there on it spins.
     pub fn wait(
@@ -383,7 +383,7 @@ mod tests {
         assert!(waiter.is_realtime());
         let meagre = Throttle { runtime_us: 100, period_us: 1_000_000 };
         let mut budget = Budget::new(meagre, clock.now(), Duration::ZERO);
-        budget.look(clock.now(), Duration::from_secs(1));
+        budget.check(clock.now(), Duration::from_secs(1));
         waiter.budget = Some(budget);
         assert!(!waiter.is_realtime());
     }

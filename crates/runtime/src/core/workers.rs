@@ -70,7 +70,8 @@ pub(crate) struct Threads {
 
 impl Threads {
     /// No workers yet. A worker unparks `core` when a job is done, and notes in `heartbeat` since when it runs the
-    /// job. It records its jobs in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
+    /// job. It records its jobs in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so
+    /// that workers may poll.
     pub(crate) fn new(
         core: Arc<Parker>,
         prepare: Prepare,

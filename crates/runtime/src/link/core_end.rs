@@ -45,7 +45,7 @@ pub(crate) struct CoreEnd {
     pub(crate) may_poll: bool,
 }
 
-/// Counts of what the core was handed up to an instant.
+/// How many blocks and requests the core had been handed at an instant.
 #[derive(Clone, Copy)]
 pub(crate) struct Handed {
     blocks: u32,

@@ -46,7 +46,7 @@ pub(crate) struct Handshake {
     is_overdue: bool,
 }
 
-/// The state of an handshake.
+/// The state of a handshake.
 pub(crate) enum Step {
     /// The host's bytes have to wait.
     Wait,
@@ -58,7 +58,7 @@ pub(crate) enum Step {
 
 impl Handshake {
     /// Starts the threads that search. Call it before the link gets real-time priority, or they inherit it. `only` is
-    /// the one dialect that is spoken, or `None`. `wire` is the host's wire, and `terminal` is what it has open.
+    /// the one dialect that is spoken, or `None`. `wire` is the host's wire, and `terminal` is the one that it has open.
     pub(crate) fn start(
         only: Option<DialectName>,
         board: &dyn Board,

@@ -21,7 +21,7 @@ pub(crate) const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Watches over the program: signals, the guardian and the watchdogs.
 pub(crate) struct Oversight {
-    /// Signals and the guardian, both of which are rare. So the link has one descriptor less to wait for.
+    /// Signals and the guardian. Both are rare, so they share one descriptor, and the link waits for fewer.
     events: Epoll,
     signals: Signals,
     guardian: Option<GuardianWatch>,

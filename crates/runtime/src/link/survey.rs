@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Looks at the board and the wire again when a host comes. A chip may have appeared since the program started: its driver was
-//! loaded late at boot, or somebody has plugged it in. So the host reads the names that are true now.
+//! Searches the board and the wire again when a host comes. A chip may have appeared since the program started: its
+//! driver was loaded late at boot, or somebody has plugged it in. So the host reads the present names.
 
 #![forbid(unsafe_code)]
 
@@ -73,7 +73,7 @@ impl Surveyor {
         Ok(Surveyor { asks, answers, pending: 0, found: None })
     }
 
-    /// Asks what the board has now.
+    /// Asks for the board's present devices.
     pub(crate) fn ask(&mut self) {
         // The thread ends only with its questions.
         self.pending += usize::from(self.asks.send(()).is_ok());

@@ -280,7 +280,7 @@ impl LinkThread {
         Ok(woken)
     }
 
-    /// `due` is the link's own time.
+    /// `due` is the link's own deadline.
     fn timeout(&self, stalled: bool, due: Option<Duration>, now: Duration) -> PollTimeout {
         let due = self.oversight.due().into_iter().chain(due).min().map(|at| at.saturating_sub(now));
         stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, poll_timeout)
@@ -294,7 +294,7 @@ impl LinkThread {
         self.oversight.lose_guardian();
     }
 
-    /// Reads what has come. True if no host can come any more.
+    /// Reads the bytes that have come. True if no host can come any more.
     fn read(&mut self, hung_up: bool) -> io::Result<bool> {
         let was_open = self.host.is_open();
         let read = self.host.read(hung_up)?;
@@ -322,7 +322,7 @@ impl LinkThread {
         Ok(read.is_over)
     }
 
-    /// Whether the link still has to find out the host's dialect, or what the board has.
+    /// Whether the link still has to find the host's dialect or the board's devices.
     fn is_finding(&mut self) -> bool {
         loop {
             match self.handshake.step(self.known.dialect.name()) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The kernel's accounts of this computer: how long threads waited for a processor, and what slows the computer
-//! down. Not every computer has all of them.
+//! The kernel's accounts of this computer: how long threads waited for a processor, and what else slows the
+//! computer down. Not every computer has all of them.
 
 #![forbid(unsafe_code)]
 
@@ -29,7 +29,7 @@ const RARELY: u32 = 32;
 /// Longest file of sysfs or procfs that is read.
 const FILE_BYTES: u64 = 1 << 16;
 
-/// Reads it all, and records what has changed.
+/// Reads the accounts, and records their changes.
 pub(super) struct Computer {
     root: PathBuf,
     writer: Writer,
@@ -37,7 +37,7 @@ pub(super) struct Computer {
     /// A Raspberry Pi's file with the firmware's bits.
     throttled: Option<PathBuf>,
     /// Number of samples so far, and since something happened.
-    looks: u32,
+    samples: u32,
     calm: u32,
     stolen: Option<u64>,
     power: Option<PowerFault>,
@@ -49,7 +49,7 @@ pub(super) struct Computer {
 struct Account {
     thread: Watched,
     file: File,
-    /// Where the thread writes what it does, and how many events it had at the last sample.
+    /// The ring of the thread's events, and how many events it had at the last sample.
     ring: Ring<'static>,
     written: u64,
     before: Option<Times>,
@@ -69,10 +69,10 @@ impl Computer {
         let pattern = root.join(throttled::FILES.trim_start_matches('/'));
         // The search goes through many folders, so it is done once.
         let throttled = glob::glob(&pattern.to_string_lossy()).ok().and_then(|files| files.flatten().next());
-        Computer { root, writer, accounts: Vec::new(), throttled, looks: 0, calm: 0, stolen: None, power: None, hz }
+        Computer { root, writer, accounts: Vec::new(), throttled, samples: 0, calm: 0, stolen: None, power: None, hz }
     }
 
-    /// Reads the kernel's account of this thread, too. It writes what it does into this ring.
+    /// Reads the kernel's account of this thread, too. The ring has the thread's events.
     pub(super) fn watch(&mut self, thread: Watched, tid: Pid, ring: Ring<'static>) {
         // The file stays open: opening it takes longer than reading it. A kernel without the account has no file.
         if let Ok(file) = File::open(self.root.join(format!("proc/self/task/{tid}/schedstat"))) {
@@ -85,22 +85,22 @@ impl Computer {
         String::from_utf8(bytes).ok()
     }
 
-    /// Records what has changed since the last call. It reads most things only if `all`, and at some other calls.
+    /// Records the changes since the last call. It reads most things only if `all`, and at some other calls.
     /// Returns the time of the next sample.
-    pub(super) fn look(&mut self, at: Clock, all: bool) -> Duration {
-        let all = all || self.looks.is_multiple_of(RARELY);
-        self.looks = self.looks.wrapping_add(1);
-        self.calm = if self.look_at_threads(at, all) { 0 } else { self.calm.saturating_add(1) };
+    pub(super) fn sample(&mut self, at: Clock, all: bool) -> Duration {
+        let all = all || self.samples.is_multiple_of(RARELY);
+        self.samples = self.samples.wrapping_add(1);
+        self.calm = if self.sample_threads(at, all) { 0 } else { self.calm.saturating_add(1) };
         if all {
-            self.look_at_all(at);
+            self.sample_all(at);
         }
         let again = if self.calm < CALM { OFTEN } else { SELDOM };
         self.writer.write(at, Event::Looked { again: ticks(again.as_nanos() as u64), all });
         again
     }
 
-    fn look_at_all(&mut self, at: Clock) {
-        self.look_at_stolen_time(at);
+    fn sample_all(&mut self, at: Clock) {
+        self.sample_stolen_time(at);
         let power = self.power_fault();
         // Repeat conditions that last: the ring overwrites old events.
         if power != self.power || power.is_some() {
@@ -114,7 +114,7 @@ impl Computer {
     }
 
     /// Whether a thread has written something.
-    fn look_at_threads(&mut self, at: Clock, all: bool) -> bool {
+    fn sample_threads(&mut self, at: Clock, all: bool) -> bool {
         let mut has_news = false;
         for Account { thread, file, ring, written, before } in &mut self.accounts {
             let old = std::mem::replace(written, ring.next());
@@ -135,7 +135,7 @@ impl Computer {
         has_news
     }
 
-    fn look_at_stolen_time(&mut self, at: Clock) {
+    fn sample_stolen_time(&mut self, at: Clock) {
         let Some(now) = self.read("/proc/stat").and_then(|stat| stolen(&stat)) else { return };
         if let Some(before) = self.stolen.replace(now).filter(|before| *before < now) {
             let seconds = u64::from(pinion_firmware::time::CLOCK_FREQ);
@@ -222,39 +222,39 @@ mod tests {
         put(root, "/proc/self/task/7/schedstat", "");
         computer.watch(Watched::Core, Pid::from_raw(7), ring_of(8));
         let mut seen = 0;
-        let mut look = || {
-            computer.look(Clock::EPOCH, true);
+        let mut sample = || {
+            computer.sample(Clock::EPOCH, true);
             let mut events = events(ring);
             assert!(matches!(events.pop(), Some(Event::Looked { all: true, .. })));
             let new = events[seen..].to_vec();
             seen = events.len() + 1;
             new
         };
-        assert_eq!(look(), []);
+        assert_eq!(sample(), []);
         put(root, "/proc/self/task/7/schedstat", "1000000 5000 12\n");
         put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 100 0 0\ncpu0 1 2\n");
         put(root, "/sys/devices/system/cpu/cpu0/cpufreq/scaling_cur_freq", "600000\n");
         put(root, "/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq", "1500000\n");
         let still = Event::Processor { thread: Watched::Core, ran: Ticks(0), waited: Ticks(0) };
         let frequency = Event::Frequency { mhz: 600, max_mhz: 1500 };
-        assert_eq!(look(), [still, frequency]);
+        assert_eq!(sample(), [still, frequency]);
         put(root, "/proc/self/task/7/schedstat", "3000000 12005000 15\n");
         put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 103 0 0\n");
         put(root, PI_THROTTLED, "50005\n");
         let processor = Event::Processor { thread: Watched::Core, ran: Ticks::from_ms(2), waited: Ticks::from_ms(12) };
         let power = Event::Power(Some(PowerFault::Undervoltage));
-        assert_eq!(look(), [processor, Event::Stolen(Ticks(3 * 50_000_000 / 100)), power, frequency]);
+        assert_eq!(sample(), [processor, Event::Stolen(Ticks(3 * 50_000_000 / 100)), power, frequency]);
         put(root, PI_THROTTLED, "50004\n");
         let hot = Event::Power(Some(PowerFault::Hot));
-        assert_eq!(look(), [still, hot, frequency]);
-        assert_eq!(look(), [still, hot, frequency], "the ring forgets");
+        assert_eq!(sample(), [still, hot, frequency]);
+        assert_eq!(sample(), [still, hot, frequency], "the ring forgets");
         put(root, PI_THROTTLED, "50000\n");
-        assert_eq!(look(), [still, Event::Power(None), frequency]);
-        assert_eq!(look(), [still, frequency]);
+        assert_eq!(sample(), [still, Event::Power(None), frequency]);
+        assert_eq!(sample(), [still, frequency]);
         fs::remove_file(root.join(PI_THROTTLED.trim_start_matches('/'))).unwrap();
         put(root, "/sys/class/hwmon/hwmon1/name", "rpi_volt\n");
         put(root, "/sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1\n");
-        assert_eq!(look(), [still, power, frequency]);
+        assert_eq!(sample(), [still, power, frequency]);
     }
 
     #[test]
@@ -268,30 +268,30 @@ mod tests {
             computer.watch(thread, Pid::from_raw(tid), of);
         }
         let (mut core, mut link) = (Writer::new(core, "core").unwrap(), Writer::new(link, "link").unwrap());
-        let mut look = |all| {
+        let mut sample = |all| {
             let before = events(ring).len();
-            let again = computer.look(Clock::EPOCH, all);
+            let again = computer.sample(Clock::EPOCH, all);
             let looked = events(ring)[before..].to_vec();
             let is_of = |thread| {
                 looked.iter().any(|event| matches!(event, Event::Processor { thread: of, .. } if *of == thread))
             };
             (again, is_of(Watched::Core), is_of(Watched::Link))
         };
-        assert_eq!(look(false), (OFTEN, true, true), "the first look is at everything");
+        assert_eq!(sample(false), (OFTEN, true, true), "the first sample has everything");
         for _ in 2..CALM {
             // A core that hangs writes nothing.
-            assert_eq!(look(false), (OFTEN, true, false));
+            assert_eq!(sample(false), (OFTEN, true, false));
         }
-        assert_eq!(look(false), (SELDOM, true, false));
+        assert_eq!(sample(false), (SELDOM, true, false));
         link.write(Clock::EPOCH, Event::Out(1));
-        assert_eq!(look(false), (OFTEN, true, true));
+        assert_eq!(sample(false), (OFTEN, true, true));
         for _ in 1..CALM {
-            look(false);
+            sample(false);
         }
-        assert_eq!(look(false).0, SELDOM);
+        assert_eq!(sample(false).0, SELDOM);
         core.write(Clock::EPOCH, Event::Pace { worst: Ticks(1) });
-        assert_eq!(look(false), (OFTEN, true, false));
-        assert_eq!(look(true), (OFTEN, true, true));
+        assert_eq!(sample(false), (OFTEN, true, false));
+        assert_eq!(sample(true), (OFTEN, true, true));
     }
 
     #[test]
@@ -299,10 +299,10 @@ mod tests {
         let ring = ring_of(256);
         let mut computer = Computer::new("/".into(), Writer::new(ring, "sampler").unwrap());
         computer.watch(Watched::Core, nix::unistd::gettid(), ring_of(8));
-        computer.look(Clock::EPOCH, false);
+        computer.sample(Clock::EPOCH, false);
         let until = std::time::Instant::now() + std::time::Duration::from_millis(20);
         while std::time::Instant::now() < until {}
-        computer.look(Clock::EPOCH, false);
+        computer.sample(Clock::EPOCH, false);
         let events = events(ring).into_iter();
         let ran = events.filter_map(|event| if let Event::Processor { ran, .. } = event { Some(ran) } else { None });
         let ran: Vec<Ticks> = ran.collect();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The flight recorder. Each thread writes 16-byte events into a ring of its own (`memory.rs`, `trace_writer.rs`). A thread of
-//! low priority reads the kernel's accounts some times a second (`computer.rs`). At each stop of the MCU it keeps the
-//! rings in a file, and logs who was late. If the program dies or hangs, the guardian does that.
+//! The flight recorder. Each thread writes 16-byte events into a ring of its own (`memory.rs`, `trace_writer.rs`). A
+//! thread of low priority reads the kernel's accounts some times a second (`computer.rs`). At each stop of the MCU it
+//! keeps the rings in a file, and logs who was late. If the program dies or hangs, the guardian does that.
 
 #![forbid(unsafe_code)]
 
@@ -231,7 +231,7 @@ impl Recording {
     }
 }
 
-/// Whether the host, or who stops its service, had asked for the stop, and nobody was late.
+/// Whether the host or a signal had asked for the stop, and nobody was late.
 fn is_asked(trace: &Trace, found: &Verdict) -> bool {
     let asked = [reason::COMMAND_REQUEST.text(), reason::FORCE_SHUTDOWN.text()];
     found.culprit == Culprit::Nobody
@@ -272,7 +272,7 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// A recorder whose thread has not started, and the core's trace_writer.
+    /// A recorder whose thread has not started, and the core's trace writer.
     pub(super) fn new(recording: Recording) -> io::Result<(Recorder, TraceWriter)> {
         let wake = Arc::new(EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?);
         let (producer, news) = RingBuffer::new(NEWS);
@@ -365,7 +365,7 @@ impl Keeper {
         self.publish();
         loop {
             if monotonic() >= next {
-                next = monotonic() + computer.look(self.recording.clock.now(), false);
+                next = monotonic() + computer.sample(self.recording.clock.now(), false);
             }
             while let Ok(news) = self.news.pop() {
                 match news {
@@ -380,7 +380,7 @@ impl Keeper {
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
                         // The accounts at the stop show more than those before it.
-                        next = monotonic() + computer.look(self.recording.clock.now(), true);
+                        next = monotonic() + computer.sample(self.recording.clock.now(), true);
                         let end = End::Shutdown { reason: reason.to_owned(), trouble };
                         self.recording.keep_stop(&self.recording.trace(end, at), &mut self.paces);
                     }

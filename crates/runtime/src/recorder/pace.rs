@@ -9,7 +9,7 @@ use std::time::Duration;
 pub(super) struct Pace {
     at_once: u32,
     every: Duration,
-    /// When all that was admitted would have been done at an even pace.
+    /// When all admitted work would be done at an even pace.
     due: Duration,
 }
 

@@ -55,7 +55,7 @@ pub(crate) struct TraceWriter {
     pace_at: Clock,
 }
 
-/// The state that the core had when it was last looked at: a bit for each of these. So one comparison finds a change.
+/// The core's state at the last call: a bit for each of these conditions. So one comparison finds a change.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 struct State(u8);
 
@@ -125,7 +125,7 @@ impl TraceWriter {
         self.recent.write(at, Event::Command { id, more: (count - 1).min(u8::MAX.into()) as u8 });
     }
 
-    /// Records what has changed since the last call. The core calls it when no timer is due, and while it is behind.
+    /// Records the changes since the last call. The core calls it when no timer is due, and while it is behind.
     #[inline]
     pub(crate) fn turn(&mut self, mcu: &mut Mcu, is_ordinary: bool) {
         let at = mcu.last_read();

@@ -96,8 +96,8 @@ impl Drop for Place {
 }
 
 /// Opens a socket at the first of these paths where that is possible. Users who may open the host's terminal may
-/// connect: the socket gets the terminal's group. Without a terminal it keeps our own group. A path where another instance answers is not taken over. If it
-/// is possible nowhere, `complain` gets the errors.
+/// connect: the socket gets the terminal's group. Without a terminal it keeps our own group. A path where another
+/// instance answers is not taken over. If it is possible nowhere, `complain` gets the errors.
 pub(crate) fn open(
     paths: &[PathBuf],
     terminal: Option<&Path>,

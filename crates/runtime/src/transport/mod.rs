@@ -63,7 +63,7 @@ pub(crate) trait Transport {
         None
     }
 
-    /// Reads what has come. `hung_up`: the descriptor has hung up.
+    /// Reads the bytes that have come. `hung_up`: the descriptor has hung up.
     ///
     /// # Errors
     ///

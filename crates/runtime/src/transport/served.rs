@@ -11,12 +11,14 @@ use std::path::{Path, PathBuf};
 
 use nix::unistd::geteuid;
 
-use crate::host::klippy::process::{self, Process, is_pseudo_terminal, server};
+use crate::host::klippy::process::{self, Process};
+use crate::host::klippy::terminal::server;
 use pinion_linux::foreign;
+use pinion_linux::uart::is_pseudo_terminal;
 
 /// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
-/// Longest part of /proc/PID/cgroup that is looked at.
+/// Longest part of /proc/PID/cgroup that is read.
 const GROUPS_BYTES_MAX: u64 = 4096;
 /// How much younger than its link a served terminal may be. Klipper's own program changes the mode after it makes the
 /// link.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Standard input and output: the host, or what leads to it, has started the program. The program ends with the input.
+//! Standard input and output: the host, or a program on the way to it, has started Pinion. Pinion ends with the input.
 
 #![forbid(unsafe_code)]
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The boards of a description.
+//! The boards of a description, and the pins in use on them.
 
 #![forbid(unsafe_code)]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use serde::{Deserialize, Serialize};
 
@@ -85,5 +85,44 @@ impl McuConfig {
             })
         });
         names.collect()
+    }
+}
+
+/// The pins that are already in use, by name.
+pub(crate) struct UsedPins<'a> {
+    boards: Boards<'a>,
+    /// By the board and the name there: what may share the pin.
+    used: HashMap<(usize, String), Option<&'static str>>,
+}
+
+impl<'a> UsedPins<'a> {
+    /// All pins of these boards are free.
+    pub(crate) fn of(boards: Boards<'a>) -> UsedPins<'a> {
+        UsedPins { boards, used: HashMap::new() }
+    }
+
+    /// Marks a pin as used, if there is one. Fails if the pin is already in use.
+    pub(crate) fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), Trouble> {
+        self.claim_for(None, whose, key, pin)
+    }
+
+    /// Marks a pin that several of `sharers` may use.
+    pub(crate) fn claim_for(
+        &mut self,
+        sharers: Option<&'static str>,
+        whose: &str,
+        key: &str,
+        pin: Option<&PinName>,
+    ) -> Result<(), Trouble> {
+        let Some(pin) = pin else { return Ok(()) };
+        let Some(board) = self.boards.of(&pin.name) else {
+            let cause = format!("pin `{}` is on no board", pin.name);
+            return wrong(whose, key, &cause, "add an [[mcu]] of this name");
+        };
+        let before = self.used.insert((board, on_board(&pin.name).1.to_owned()), sharers);
+        if before.is_some_and(|others| others.is_none() || others != sharers) {
+            return wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name");
+        }
+        Ok(())
     }
 }

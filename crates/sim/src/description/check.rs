@@ -3,57 +3,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 
 pub(crate) use pinion_firmware::trouble::Trouble;
 
-use super::boards::Boards;
-use super::pin::{PinName, is_word, on_board};
+use super::pin::is_word;
 
 /// The allowed range of a number.
 pub(crate) enum Bound {
     Any,
     NotNegative,
     AboveZero,
-}
-
-/// The pins that are already in use, by name.
-pub(crate) struct UsedPins<'a> {
-    boards: Boards<'a>,
-    /// By the board and the name there: what may share the pin.
-    used: HashMap<(usize, String), Option<&'static str>>,
-}
-
-impl<'a> UsedPins<'a> {
-    /// All pins of these boards are free.
-    pub(crate) fn of(boards: Boards<'a>) -> UsedPins<'a> {
-        UsedPins { boards, used: HashMap::new() }
-    }
-
-    /// Marks a pin as used, if there is one. Fails if the pin is already in use.
-    pub(crate) fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), Trouble> {
-        self.claim_for(None, whose, key, pin)
-    }
-
-    /// Marks a pin that several of `sharers` may use.
-    pub(crate) fn claim_for(
-        &mut self,
-        sharers: Option<&'static str>,
-        whose: &str,
-        key: &str,
-        pin: Option<&PinName>,
-    ) -> Result<(), Trouble> {
-        let Some(pin) = pin else { return Ok(()) };
-        let Some(board) = self.boards.of(&pin.name) else {
-            let cause = format!("pin `{}` is on no board", pin.name);
-            return wrong(whose, key, &cause, "add an [[mcu]] of this name");
-        };
-        let before = self.used.insert((board, on_board(&pin.name).1.to_owned()), sharers);
-        if before.is_some_and(|others| others.is_none() || others != sharers) {
-            return wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name");
-        }
-        Ok(())
-    }
 }
 
 /// Checks that all parts of a kind have names, and that the names are unique.

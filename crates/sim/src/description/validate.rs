@@ -6,8 +6,9 @@
 use std::collections::HashSet;
 
 use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
+use super::boards::UsedPins;
 use super::buses::{I2cBusConfig, SpiBusConfig};
-use super::check::{Bound, Trouble, UsedPins, check, no_name, there_is, unique, wrong};
+use super::check::{Bound, Trouble, check, no_name, there_is, unique, wrong};
 use super::heater::{FanConfig, HeaterConfig};
 use super::kinematics::WinchConfig;
 use super::outputs::LedConfig;

@@ -205,12 +205,6 @@ impl Recorder {
         &self.points
     }
 
-    /// The greatest distance of the nozzle from the path along x, y and z, at each instant: 1.5 steps of the axis with
-    /// the longest steps.
-    pub fn tolerance_mm(&self) -> f64 {
-        self.off_mm[0]
-    }
-
     /// The filament of a step, of the extruder with the longest steps.
     pub fn filament_step_mm(&self) -> f64 {
         self.off_mm[3] / STEPS_OFF

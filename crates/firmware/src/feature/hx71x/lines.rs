@@ -188,7 +188,7 @@ impl Job for WatchReading {
 
 impl Watcher {
     fn run(&mut self) -> Result<(), Shutdown> {
-        // The pulse that is watched, and since when.
+        // The watched pulse, and the time from which it is watched.
         let (mut pulse, mut since) = (0, self.time.now());
         // The clock was low then, and the longest time that it may have been high during this pulse.
         let (mut low_at, mut longest) = (since, 0);
@@ -242,7 +242,7 @@ mod tests {
     use std::thread;
     use std::time::{Duration, Instant};
 
-    /// A clock that is this many times slower than that of the computer. So other programs disturb the workers less.
+    /// A clock that is this many times slower than the computer's. So other programs disturb the workers less.
     struct Slow(Instant, u32);
 
     impl TimeSource for Slow {
@@ -268,8 +268,8 @@ mod tests {
         interrupted: Option<u32>,
         /// How often the clock was made low while it was high.
         falls: AtomicU32,
-        /// How long the first look at the clock takes, if it is high.
-        look: Mutex<Duration>,
+        /// How long the first read of the clock line takes, if it is high.
+        first_read: Mutex<Duration>,
     }
 
     const SAMPLE: u32 = 0x12_3457;
@@ -304,7 +304,7 @@ mod tests {
         fn read(&self) -> Result<bool, Shutdown> {
             let pulses = self.chip.pulses.load(Ordering::SeqCst);
             if self.is_clock && self.chip.is_high.load(Ordering::SeqCst) {
-                thread::sleep(std::mem::take(&mut *self.chip.look.lock().unwrap()));
+                thread::sleep(std::mem::take(&mut *self.chip.first_read.lock().unwrap()));
             }
             Ok(if self.is_clock { self.chip.is_high.load(Ordering::SeqCst) } else { SAMPLE >> (25 - pulses) & 1 != 0 })
         }
@@ -407,7 +407,7 @@ mod tests {
     fn a_second_worker_that_was_itself_away_lowers_the_clock_before_it_ends() {
         let (_, mut watcher, chip) = workers(None, 1);
         chip.is_high.store(true, Ordering::SeqCst);
-        *chip.look.lock().unwrap() = Duration::from_millis(10);
+        *chip.first_read.lock().unwrap() = Duration::from_millis(10);
         watcher.watch.announce(1);
         watcher.run().unwrap();
         assert_eq!(chip.falls.load(Ordering::SeqCst), 1);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! An HX711 or HX717 on the data lines of an SPI controller: MOSI is the chip's clock, MISO its data. The controller
-//! times the pulses, whatever the processors do.
+//! times the pulses, so a busy processor does not matter.
 //!
 //! A pulse is two bits of MOSI, `10`. At 500 kHz a bit is 2 us long. So the clock is high for 2 us and low for 2 us. The
 //! data sheet has 0.2 to 50 us (T3), and at least 0.2 us (T4). Controllers round the rate down. From 20 kHz on they are
@@ -47,7 +47,7 @@ pub(super) struct Waves {
     pulses: u8,
     /// The clock's name in the log.
     name: String,
-    /// Looks since the last sample.
+    /// Polls since the last sample.
     looks: u32,
     /// Whether there was a warning about a chip without samples.
     has_warned: bool,
@@ -62,10 +62,10 @@ impl Waves {
 
     /// Reads a sample, if one is ready.
     pub(super) fn run(&mut self) -> Result<Option<Shifted>, Shutdown> {
-        let mut look = [0];
-        self.exchange(&mut look)?;
+        let mut poll = [0];
+        self.exchange(&mut poll)?;
         // The last bit is the newest.
-        if look[0] & 1 != 0 {
+        if poll[0] & 1 != 0 {
             self.looks = self.looks.saturating_add(1);
             if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.has_warned, true) {
                 let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once");

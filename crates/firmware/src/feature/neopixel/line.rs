@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! WS2812 LEDs on a GPIO line, pulse by pulse.
 //!
-//! The times are those of Klipper's src/neopixel.c, which says what chips really need: a short pulse below 500 ns,
+//! The times are from Klipper's src/neopixel.c, which has the needs of real chips: a short pulse below 500 ns,
 //! a long one above 650 ns, 5 us from pulse to pulse at most, 1.25 us on average, 200 ns between two edges. Klipper's C
 //! shuts out interrupts during a pulse. A program on Linux cannot. So each pulse is measured by the clock. The clock is
 //! read before and after each edge, and its step is part of the limits. So a pulse is surely longer than its shortest
-//! time and shorter than its longest. If a pulse missed its times, the frame is broken off, and sent again after the
+//! time and shorter than its longest. After a pulse with a late edge, the frame is aborted and sent again after the
 //! reset time. Until then the LEDs may show wrong colors.
 //!
 //! A call of the kernel takes longer than a short pulse. So a line without registers is refused. A line behind a bus that
@@ -38,7 +38,7 @@ pub(super) const WORKER: &str = "neopixel";
 const SIZE_MAX: usize = 500;
 /// Time from pulse to pulse unless one is late. The 1.25 us of the data sheet are reached on average.
 const BIT: Ticks = Ticks(63);
-/// How often a frame is sent if pulses missed their times. klippy itself sends it eight times.
+/// How often a frame is sent if an edge is late. klippy itself sends it eight times.
 const TRIES: u32 = 3;
 
 /// The limits of measured times. The real ones are surely within the data sheet (Worldsemi WS2812B-V5, "Data transfer
@@ -85,7 +85,7 @@ pub(super) struct Pulses {
     free_at: Clock,
     /// The line's name in the log.
     name: String,
-    /// Whether there was a warning about frames that missed their times.
+    /// Whether there was a warning about frames with late edges.
     has_warned: bool,
     /// A warning for the log.
     pub(super) warning: Option<DeviceWarning>,
@@ -130,7 +130,7 @@ impl Pulses {
         Ok(Pulses { line, pace, limits, reset, free_at, name, has_warned: false, warning: None })
     }
 
-    /// Sends the colors. False if no try had its times.
+    /// Sends the colors. False if an edge was late in each try.
     pub(super) fn send(&mut self, colors: &[u8]) -> Result<bool, Shutdown> {
         for _ in 0..TRIES {
             self.pace.until(self.free_at);
@@ -153,7 +153,7 @@ impl Pulses {
         Ok(false)
     }
 
-    /// Sends the pulses until one misses its times. Returns whether none did.
+    /// Sends the pulses until an edge is late. True if none was late.
     fn frame(&self, colors: &[u8]) -> Result<bool, Shutdown> {
         let bits = colors.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 == 1));
         // The first call is slower than the others. Without this one, the first pulse would be longer.
@@ -190,13 +190,13 @@ mod tests {
 
     use crate::board::Direction;
 
-    /// A clock with steps of a 64th of this many nanoseconds. Each look at it takes 10 ns of the real time.
+    /// A clock with steps of a 64th of this many nanoseconds. Each read of it takes 10 ns of the real time.
     struct Stepped {
         real_ns: AtomicU64,
         step: u64,
     }
 
-    /// Steps of 1 ns, and those of a clock of 19.2 MHz.
+    /// Steps of 1 ns, and the steps of a clock of 19.2 MHz.
     const FINE: u64 = 64;
     const COARSE: u64 = 64 * 10_000 / 192;
 
@@ -331,7 +331,7 @@ mod tests {
         }
     }
 
-    /// Whatever is interrupted and for how long: a frame that counts as sent was understood.
+    /// A frame that counts as sent was understood, for interruptions at any place and of any length.
     #[test]
     fn a_frame_that_missed_its_times_is_sent_again() {
         let mut again = 0;

@@ -5,7 +5,7 @@
 //! 937.5 ns high, of 1250 ns. The data sheet has 400 and 800 ns, 150 more or less, of 1250 ns (Worldsemi WS2812B, "Data
 //! transfer time"). Each byte on the wire ends low. So a pause of the controller between two bytes does not change a
 //! bit. A controller that only has a lower rate, down to 2 MHz, also works. Only the short pulse is critical. It must
-//! be below 500 ns (Klipper's src/neopixel.c says what chips really need).
+//! be below 500 ns (Klipper's src/neopixel.c has the needs of real chips).
 //!
 //! Klipper's C gives up a frame if a bit comes more than `bit_max_ticks` after the one before. Pinion cannot see
 //! whether a controller pauses during a message. The log names a controller that is known to pause. A frame counts as

@@ -12,10 +12,10 @@
 //! A message begins between two ticks of the kernel, if there is time enough. They are 4 ms apart on most computers.
 //!
 //! The bits of a message count from the start bit of their byte, as the driver counts them. So a late start bit does no
-//! harm. If another bit is late, the message is broken off. A driver forgets a message after a pause of 63 bits. It
+//! harm. If another bit is late, the message is aborted. A driver forgets a message after a pause of 63 bits. It
 //! obeys a message only after its last byte, the checksum. So a write can be sent again too, unless the end of that byte
-//! was a little late. The answer to a read counts only if none of its bits was late: a register is never read wrong because this
-//! computer was late.
+//! was a little late. The answer to a read counts only if none of its bits was late. So a late computer never reads a
+//! register wrong.
 
 #![forbid(unsafe_code)]
 
@@ -33,7 +33,7 @@ const LOOKS: u32 = 16;
 /// How often a message is sent if a bit was late. klippy itself asks five times. It cannot know whether the driver or
 /// this computer was late.
 const TRIES: u32 = 16;
-/// How long the line is quiet after a message that was broken off: 63 bits until the driver gives it up, and 12 until it
+/// How long the line is quiet after an aborted message: 63 bits until the driver gives it up, and 12 until it
 /// takes another (TMC2209 data sheet, section 4.1.1: "reset by a pause of longer than 63 bit times"), and some.
 const RECOVERY_BITS: u32 = 80;
 /// A message begins with a start bit and a sync nibble. The driver takes its rate from them.
@@ -75,7 +75,7 @@ pub(super) struct Lines {
 enum Sent {
     /// All bits. The last one ended at `end`. A bit was this long.
     All { end: Clock, bit: Ticks },
-    /// It was broken off before its last byte, because a bit was late.
+    /// It was aborted before its last byte, because a bit was late.
     Part,
     /// The MCU stopped.
     Stopped,
@@ -127,7 +127,7 @@ impl Lines {
         let mut cost = 0;
         let synced = data.first().is_some_and(|first| first & SYNC_MASK == SYNC);
         let mut line = true;
-        // The first bit is a start bit, whatever the host says.
+        // The first bit is sent as a start bit, even if the host gave another one.
         for place in 0..(8 * data.len()).max(1) {
             let level = place > 0 && bit_of(data, place);
             if level != line {
@@ -165,7 +165,7 @@ impl Lines {
         Ok(if self.pace.until(at) { Sent::All { end: at, bit } } else { Sent::Stopped })
     }
 
-    /// Breaks off a message after the edge of the bit at `place`, which was due `at` and late. Returns false if the driver
+    /// Aborts a message after the edge of the bit at `place`, which was due `at` and late. Returns false if the driver
     /// may have the whole message.
     fn break_off(&self, data: &[u8], place: usize, at: Clock, bit: Ticks) -> Result<bool, Shutdown> {
         let places = 8 * data.len();
@@ -475,7 +475,7 @@ mod tests {
     /// Otherwise it may have it.
     #[test]
     fn a_write_is_sent_again_if_its_stop_bit_was_low() {
-        // The bytes f5, 00, 06 and 3c: the last edge is that of the stop bit.
+        // The bytes f5, 00, 06 and 3c: the last edge begins the stop bit.
         const WRITE: [u8; MESSAGE.len()] = [0xea, 0x03, 0xc8, 0x20, 0x9e];
         const STOP: usize = 15;
         for (late_percent, again) in [(20, false), (50, false), (70, false), (80, true), (300, true)] {

@@ -2,10 +2,10 @@
 //! A TMC UART on a serial port of the computer. The port's controller times the bits.
 //!
 //! klippy's bits become bytes, and the bytes of the reply become bits again. With the usual cabling, RX is connected to
-//! the driver's only wire, and TX through a resistor. So the port also receives what it sends: the echo. It comes before
-//! the reply, and is taken off. With other cabling there is no echo. The received bytes themselves show it: an echo repeats
-//! the message from its first byte on. A reply cannot be taken for an echo. It begins with 05 FF, and FF is no driver's
-//! address.
+//! the driver's only wire, and TX through a resistor. So the port also receives its own bytes: the echo. It comes before
+//! the reply, and is removed. With other cabling there is no echo. The received bytes themselves show it: an echo
+//! repeats the message from its first byte on. A reply cannot be taken for an echo. It begins with 05 FF, and FF is no
+//! driver's address.
 //!
 //! A reply that does not come, or is not whole, is empty, as in Klipper's C. klippy then asks again. This is also the
 //! answer if the port fails. klippy stops the printer if it needed the answer.
@@ -124,7 +124,7 @@ impl Port {
         Ok(heard)
     }
 
-    /// The rest of what comes now is no part of the next reply.
+    /// The bytes that still come now do not belong to the next reply.
     fn await_quiet(&mut self) -> Result<(), Trouble> {
         for _ in 0..QUIET_READS {
             if self.device.receive(&mut [0; 64], self.limit)? == 0 {

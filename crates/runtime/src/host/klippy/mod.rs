@@ -12,8 +12,10 @@ use std::time::SystemTime;
 use pinion_firmware::mcu::{DialectName, Dialects, Feature};
 use pinion_linux::foreign;
 
+pub mod command_line;
 pub mod process;
 pub mod sources;
+pub mod terminal;
 
 use sources::{Shape, Sources};
 

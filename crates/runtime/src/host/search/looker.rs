@@ -19,7 +19,8 @@ use nix::unistd::{SysconfVar, sysconf};
 use serde::Serialize;
 
 use crate::host::klippy::Checkout;
-use crate::host::klippy::process::{Process, Search, Terminal, find};
+use crate::host::klippy::process::Process;
+use crate::host::klippy::terminal::{Search, Terminal, find};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
 use pinion_linux::foreign;
@@ -42,7 +43,7 @@ const STAT_BYTES_MAX: u64 = 1 << 20;
 /// Highest number of unknown forms of messages that the log names.
 const UNKNOWN_SHOWN: usize = 10;
 
-/// The remedy for a host that cannot be looked into.
+/// The remedy for a host that cannot be inspected.
 const REMEDY: &str = "for an older one name its --dialect, or give Pinion the capabilities CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them";
 
 /// Looks for hosts until the program closes its end of the socket.
@@ -87,7 +88,7 @@ fn settle(socket: &OwnedFd) -> io::Result<()> {
     let _ = sys::set_other();
     forked::settle(NAME, &[socket.as_raw_fd()]);
     sys::keep_only(sys::LOOK_INTO_OTHERS)?;
-    // The process ends with the program's first thread, whatever it waits for then. That thread lives as long as the
+    // The process ends with the program's first thread, even while the process waits. That thread lives as long as the
     // program.
     prctl::set_pdeathsig(Signal::SIGKILL)?;
     sys::allow_only_reading()
@@ -107,11 +108,11 @@ impl Say {
     }
 }
 
-/// Looks at hosts, one after the other.
+/// Inspects hosts, one after the other.
 #[derive(Default)]
 struct Looker {
     /// The host that was seen last. A process continues with the sources that it has loaded, even if the files change.
-    /// klippy's RESTART keeps the process. A host whose sources could not be read is looked at again.
+    /// klippy's RESTART keeps the process. A host whose sources could not be read is inspected again.
     last: Option<(Process, DialectName)>,
     /// The same host, for the status.
     host: Option<FoundHost>,
@@ -166,7 +167,7 @@ fn same_folder(processes: &[Process]) -> bool {
     folders.first().is_some_and(|first| first.is_some() && folders.iter().all(|folder| folder == first))
 }
 
-/// For the log: the host gets the union, and what else the user can do.
+/// For the log: the host gets the union, and the user's other choices.
 fn union(remedy: &str) -> String {
     let stop = if remedy.is_empty() { "" } else { "; " };
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")

@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::host::klippy::process::Terminal;
+use crate::host::klippy::terminal::Terminal;
 use pinion_firmware::mcu::DialectName;
 use pinion_linux::foreign::plain;
 

@@ -26,7 +26,7 @@ use nix::errno::Errno;
 use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, recv, send, setsockopt, socketpair, sockopt};
 use nix::sys::time::{TimeVal, TimeValLike as _};
 
-use crate::host::klippy::process::Terminal;
+use crate::host::klippy::terminal::Terminal;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The link between any host and any core, for `fuzz/`. There are no threads: bytes choose what each side does next.
+//! The link between any host and any core, for `fuzz/`. There are no threads: bytes choose each side's next action.
 
 #![forbid(unsafe_code)]
 
@@ -45,7 +45,7 @@ fn clock() -> Arc<VirtualClock> {
     Arc::new(VirtualClock::at(Clock::from_ticks(0)))
 }
 
-/// Lets a host and a core of this board do what `bytes` say.
+/// Lets a host and a core of this board act as `bytes` choose.
 pub fn link(mut bytes: &[u8], board: impl FnOnce(Arc<VirtualClock>) -> Box<dyn Board>) {
     let once = ONCE.get_or_init(|| {
         let dialect = Dialect::new(&crate::FIRMWARE, &*board(clock()), DialectName::Master);
@@ -225,7 +225,7 @@ impl Bench {
         self.send(writer.payload().expect("room"));
     }
 
-    /// The host reads what there is.
+    /// The host reads all bytes that are there.
     fn listen(&mut self) {
         let Some(host) = &mut self.host else { return };
         let mut piece = [0; 4096];
@@ -240,7 +240,7 @@ impl Bench {
                 Found::Nothing => break,
                 Found::Garbage { .. } => panic!("the link wrote no block: {:?}", self.heard),
                 Found::Block(number, _) => {
-                    // Four bits of a number that never goes back, and that is never ahead of what was taken.
+                    // Four bits of a number that never goes back, and that is never ahead of the taken blocks.
                     self.known = self.known.filter(|known| taken - known < 16).map(|known| {
                         let number = (known..=taken).find(|at| Sequence::after(*at) == number);
                         number.unwrap_or_else(|| panic!("{known} blocks were done, and {taken} were taken"))

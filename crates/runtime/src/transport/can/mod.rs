@@ -120,17 +120,7 @@ impl CanBus {
     pub(crate) fn open(interface: &str, uuid: Option<CanbusUuid>) -> Result<CanBus, Trouble> {
         let CanbusUuid(uuid) = uuid.map_or_else(self::uuid, Ok)?;
         can_open(interface)?;
-        let mut bus = CanBus {
-            interface: interface.to_owned(),
-            node: Node::new(Arc::new(CanNode::new(uuid, bitrate(interface)))),
-            state: State::Gone(monotonic()),
-            is_up: true,
-            owes_answer: false,
-            full_until: None,
-            is_met: false,
-            is_renewed: false,
-            intrusion: None,
-        };
+        let mut bus = CanBus::closed(interface, CanNode::new(uuid, bitrate(interface)));
         match bus.bind() {
             Ok(socket) => bus.state = State::Open(socket),
             Err(error) if error.raw_os_error() == Some(libc::ENODEV) => {
@@ -142,6 +132,21 @@ impl CanBus {
             Err(error) => return Err(refusal(interface, error)),
         }
         Ok(bus)
+    }
+
+    /// A bus whose interface is not opened yet.
+    fn closed(interface: &str, node: CanNode) -> CanBus {
+        CanBus {
+            interface: interface.to_owned(),
+            node: Node::new(Arc::new(node)),
+            state: State::Gone(Duration::MAX),
+            is_up: true,
+            owes_answer: false,
+            full_until: None,
+            is_met: false,
+            is_renewed: false,
+            intrusion: None,
+        }
     }
 
     fn bind(&self) -> io::Result<CanSocket> {
@@ -439,17 +444,7 @@ mod tests {
 
     /// A bus without an interface.
     fn closed() -> CanBus {
-        CanBus {
-            interface: "can7".into(),
-            node: Node::new(Arc::new(CanNode::new([1, 2, 3, 4, 5, 6], None))),
-            state: State::Gone(Duration::MAX),
-            is_up: true,
-            owes_answer: false,
-            full_until: None,
-            is_met: false,
-            is_renewed: false,
-            intrusion: None,
-        }
+        CanBus::closed("can7", CanNode::new([1, 2, 3, 4, 5, 6], None))
     }
 
     /// Has the bus take a frame. The bytes for the MCU.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How a node gets its nodeid, and what it makes of a frame (docs/CANBUS_protocol.md and src/generic/canserial.c of
+//! How a node gets its nodeid, and how it understands a frame (docs/CANBUS_protocol.md and src/generic/canserial.c of
 //! Klipper). No socket is needed for that.
 
 #![forbid(unsafe_code)]
