@@ -124,15 +124,10 @@ pub(super) enum Check {
         bits: Vec<u8>,
         #[serde(default)]
         faults: Vec<Fault>,
+        detect: Option<Detect>,
     },
-    /// An I2C chip acknowledges and answers, with a CRC behind two bytes if it says so.
-    Answer {
-        #[serde(default)]
-        write: Vec<u8>,
-        bytes: usize,
-        #[serde(default)]
-        crc: bool,
-    },
+    /// An I2C chip without an id answers each of these reads.
+    Reads { reads: Vec<Read> },
     /// An I2C chip answers a temperature in 1/256 degrees.
     Temperature { write: Vec<u8>, bytes: usize },
     /// The kernel has found a thermometer.
@@ -141,14 +136,46 @@ pub(super) enum Check {
     Iio { file: String, highest: u32 },
 }
 
+/// A read of an I2C chip.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Read {
+    /// A register, or a command.
+    pub(super) write: Vec<u8>,
+    /// How long the command takes. Without it, the answer follows a repeated start.
+    #[serde(default)]
+    pub(super) wait_ms: u64,
+    /// The bits of the answer that are known.
+    pub(super) mask: Vec<u8>,
+    pub(super) bits: Vec<u8>,
+    /// The last byte is a CRC, which begins with this value.
+    pub(super) crc: Option<u8>,
+}
+
 /// A bit by which a chip reports a fault.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Fault {
     /// The byte of the answer.
+    #[serde(default)]
     pub(super) byte: usize,
     pub(super) bit: u8,
     pub(super) meaning: String,
+}
+
+/// The detection of faults by an SPI chip that only does it when it is told to.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Detect {
+    /// The register that switches it on, and gets its old value back.
+    pub(super) register: u8,
+    /// The bits that switch it on.
+    pub(super) set: u8,
+    /// How long it takes.
+    pub(super) wait_ms: u64,
+    /// The register with the faults.
+    pub(super) status: u8,
+    pub(super) faults: Vec<Fault>,
 }
 
 /// A board.
@@ -450,9 +477,18 @@ mod tests {
                 assert_eq!(way.bus == Kind::I2c, !way.addresses.is_empty(), "{}", device.name);
                 let is_asked = way.bus == Kind::Spi && way.check.is_some() && way.driver.is_none();
                 assert!(!is_asked || way.rate_hz >= 100_000, "{}", device.name);
-                if let Some(Check::Fixed { mask, bits, faults, .. }) = &way.check {
-                    let fits = mask.len() == bits.len() && mask.iter().zip(bits).all(|(mask, bits)| bits & !mask == 0);
-                    assert!(fits && faults.iter().all(|fault| fault.byte < mask.len()), "{}", device.name);
+                let fits = |mask: &[u8], bits: &[u8]| {
+                    mask.len() == bits.len() && mask.iter().zip(bits).all(|(mask, bits)| bits & !mask == 0)
+                };
+                match &way.check {
+                    Some(Check::Fixed { mask, bits, faults, .. }) => {
+                        let has_byte = faults.iter().all(|fault| fault.byte < mask.len());
+                        assert!(fits(mask, bits) && has_byte, "{}", device.name);
+                    }
+                    Some(Check::Reads { reads }) => {
+                        assert!(reads.iter().all(|read| fits(&read.mask, &read.bits)), "{}", device.name);
+                    }
+                    _ => {}
                 }
                 // Every device can be added to a Raspberry Pi 4.
                 let wires = catalog.boards[1]
