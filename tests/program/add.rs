@@ -295,6 +295,26 @@ fn all_devices_of_a_board_and_back() {
     assert_eq!(card.snapshot(), before);
 }
 
+/// An accelerometer that has both buses goes where there is room, and stays there.
+#[test]
+fn a_chip_with_two_buses_takes_the_free_one() {
+    let card = Card::pi();
+    card.added(&["adxl345", "--yes"]);
+    card.added(&["lis3dh", "--yes"]);
+    let told = card.added(&["lis2dw", "--yes"]);
+    assert!(told.contains("whose pins it would need: so it is connected by I2C."), "{told}");
+    let file = PRINTER.replace("printer.cfg", "pinion/lis2dw.cfg");
+    assert!(card.read(&file).contains("\ni2c_bus: i2c.1\n"), "{}", card.read(&file));
+    assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=i2c_arm=on\n"));
+    assert!(card.refused(&["bmi160", "--bus", "spi", "--yes"]).contains("uses spidev0.1, whose pins it would need"));
+    // The other place is free again, and the wires are made already.
+    card.added(&["lis3dh", "--undo", "--yes"]);
+    let before = card.snapshot();
+    let told = card.added(&["lis2dw", "--yes"]);
+    assert!(told.contains("by I2C\n") && told.contains("Nothing is left to change."), "{told}");
+    assert_eq!(card.snapshot(), before);
+}
+
 #[test]
 fn programs_get_the_same_as_json() {
     let card = Card::pi();

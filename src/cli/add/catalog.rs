@@ -340,6 +340,11 @@ impl KnownBoard {
         self.lines.get(&pin.to_string()).map(String::as_str)
     }
 
+    /// The places on the header for a device that is connected in this way, the best one first.
+    pub(super) fn spots(&self, way: &Way) -> impl Iterator<Item = Spot> {
+        self.bus.get(&way.bus).into_iter().flat_map(Bus::spots)
+    }
+
     /// A place on the header for a device that is connected in this way. `uses` says whether printer.cfg uses a node for
     /// another device.
     ///
@@ -347,13 +352,15 @@ impl KnownBoard {
     ///
     /// One line: another device is there.
     pub(super) fn spot(&self, way: &Way, uses: &dyn Fn(Kind, &str) -> Option<String>) -> Result<Spot, String> {
-        let Some(bus) = self.bus.get(&way.bus) else { return Ok(Spot::default()) };
+        if !self.bus.contains_key(&way.bus) {
+            return Ok(Spot::default());
+        }
         let controller = |node: &str| node.split('.').next().unwrap_or_default().to_owned();
         let is_shared = way.bus == Kind::I2c || way.bus == Kind::W1;
         // LEDs and an HX711 take every transfer on the data output for theirs.
         let is_alone = way.bus == Kind::Leds || way.bus == Kind::Spi && !way.wires.iter().any(|(_, role)| role == "cs");
         let mut refusal = String::new();
-        for spot in bus.spots() {
+        for spot in self.spots(way) {
             let others = self.bus.iter().flat_map(|(kind, other)| other.spots().map(move |other| (*kind, other)));
             let mut others = others.filter(|(kind, _)| *kind != way.bus || !is_shared);
             let conflict = others.find_map(|(kind, other)| {
@@ -369,7 +376,7 @@ impl KnownBoard {
                 Some(conflict) => refusal = conflict,
             }
         }
-        Err(format!("{refusal}: pins.md says how chips share a bus (docs/guide/pins.md)"))
+        Err(refusal)
     }
 
     /// The wires to make. `taken` are lines that are in use. `wanted` is the pin that the user has chosen for the first
