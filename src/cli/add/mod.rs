@@ -280,9 +280,6 @@ impl Work<'_> {
                 self.report.line(format_args!("Then call \"{}\" again.", self.command()));
                 return Ok(());
             }
-        } else if !self.args.dry_run && !boot.needs.is_empty() && self.computer.is_this() {
-            // It was there before, and another device's --undo must not take it away.
-            self.note(&boot)?;
         }
         if self.computer.is_this() && state == State::Due && boot.changes.is_empty() {
             return Err(format!("{} is enabled and not there: sudo reboot, then call this again", self.node()));
@@ -291,7 +288,7 @@ impl Work<'_> {
             true => self.check(printer.as_ref().ok())?,
             false => None,
         };
-        self.configure(&printer?, &wires, address)
+        self.configure(&printer?, &wires, address, boot.needs)
     }
 
     /// The command that continues.
@@ -325,8 +322,14 @@ impl Work<'_> {
         self.report.show()
     }
 
-    /// Writes the sections, and has the host read them.
-    fn configure(&mut self, printer: &Printer, wires: &[Wire], address: Option<u8>) -> Result<(), String> {
+    /// Writes the sections, and has the host read them. `boot` are the keys of what the device needs of the boot loader.
+    fn configure(
+        &mut self,
+        printer: &Printer,
+        wires: &[Wire],
+        address: Option<u8>,
+        boot: Vec<String>,
+    ) -> Result<(), String> {
         let side = host(self.computer, printer);
         let link = printer.link();
         if self.computer.is_this() && !self.args.dry_run && !link.exists() {
@@ -348,7 +351,9 @@ impl Work<'_> {
         let mut is_changed = false;
         if is_own {
             let sections = self.sections(printer, wires, address)?;
-            let (changes, needs) = printer.plan(&side, self.device, &sections)?;
+            let (changes, mut needs) = printer.plan(&side, self.device, &sections)?;
+            // Recorded here, where no root is needed: another device may have made these changes.
+            needs.extend(boot);
             let record = Record { changes, needs };
             is_changed = !record.changes.is_empty();
             if is_changed {
@@ -438,21 +443,5 @@ impl Work<'_> {
             self.report.line(format_args!("{} is a copy of what was there.", copy.display()));
         }
         Ok(())
-    }
-
-    /// Records what the device needs, if others have made it.
-    fn note(&self, record: &Record) -> Result<(), String> {
-        let side = system(self.computer);
-        if !geteuid().is_root() {
-            return Ok(());
-        }
-        let known = side.record(self.device.name)?.unwrap_or_default();
-        let is_known = record.needs.iter().all(|need| known.needs.contains(need));
-        // Nobody else's change is there to keep.
-        let is_shared = self.catalog.devices.iter().any(|other| {
-            let record = side.record(other.name).ok().flatten();
-            other.name != self.device.name && record.is_some_and(|record| !record.changes.is_empty())
-        });
-        if is_known || !is_shared { Ok(()) } else { side.make(self.device.name, record) }
     }
 }

@@ -288,8 +288,7 @@ impl Printer {
         let mut make = |key: &str, file: PathBuf, text: String| -> Result<(), String> {
             // A file that is there is left as it is: the user may have changed it.
             if side.read(&file)?.is_none() {
-                let splice = Splice { at: 0, old: String::new(), new: text };
-                changes.push(Change { key: key.to_owned(), file, makes: true, splice });
+                changes.push(Change { key: key.to_owned(), file, makes: true, splice: Splice::insert(0, text) });
             }
             Ok(())
         };
@@ -338,7 +337,7 @@ impl Printer {
         }
         let is_open = !self.text[..place].is_empty() && !self.text[..place].ends_with('\n');
         let before = if is_open { end } else { "" };
-        Splice { at: place, old: String::new(), new: format!("{before}[include pinion/*.cfg]{end}") }
+        Splice::insert(place, format!("{before}[include pinion/*.cfg]{end}"))
     }
 }
 
