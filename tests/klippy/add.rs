@@ -103,7 +103,10 @@ fn from_nothing_to_a_measured_resonance_and_back() {
     assert!(!has_chip(&mut printer));
 
     let added = pinion(&[]);
-    assert!(added["measured"].as_str().is_some_and(|told| told.ends_with("1.00 of gravity")), "{added}");
+    // The chip's noise is in it.
+    let gravity = added["measured"].as_str().and_then(|told| told.strip_suffix(" of gravity")?.rsplit(' ').next());
+    let gravity: f64 = gravity.and_then(|share| share.parse().ok()).unwrap_or_else(|| panic!("{added}"));
+    assert!((gravity - 1.0).abs() < 0.05, "{added}");
     assert!(added["warning"].is_null(), "{added}");
     assert!(has_chip(&mut printer));
     printer.gcode(WHERE_IT_STANDS);

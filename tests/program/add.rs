@@ -295,6 +295,26 @@ fn all_devices_of_a_board_and_back() {
     assert_eq!(card.snapshot(), before);
 }
 
+/// An accelerometer that has both buses goes where there is room, and stays there.
+#[test]
+fn a_chip_with_two_buses_takes_the_free_one() {
+    let card = Card::pi();
+    card.added(&["adxl345", "--yes"]);
+    card.added(&["lis3dh", "--yes"]);
+    let told = card.added(&["lis2dw", "--yes"]);
+    assert!(told.contains("whose pins it would need: so it is connected by I2C."), "{told}");
+    let file = PRINTER.replace("printer.cfg", "pinion/lis2dw.cfg");
+    assert!(card.read(&file).contains("\ni2c_bus: i2c.1\n"), "{}", card.read(&file));
+    assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=i2c_arm=on\n"));
+    assert!(card.refused(&["bmi160", "--bus", "spi", "--yes"]).contains("uses spidev0.1, whose pins it would need"));
+    // The other place is free again, and the wires are made already.
+    card.added(&["lis3dh", "--undo", "--yes"]);
+    let before = card.snapshot();
+    let told = card.added(&["lis2dw", "--yes"]);
+    assert!(told.contains("by I2C\n") && told.contains("Nothing is left to change."), "{told}");
+    assert_eq!(card.snapshot(), before);
+}
+
 #[test]
 fn programs_get_the_same_as_json() {
     let card = Card::pi();
@@ -434,7 +454,7 @@ fn the_wires_are_those_of_the_board_s_settings() {
     // Up to the Raspberry Pi 3 the audio output has the channels of the hardware PWM.
     let card = Card::of("Raspberry Pi 3 Model B Rev 1.2", &[("boot/firmware/config.txt", CONFIG_TXT)]);
     let shown = card.added(&["fan", "--dry-run"]);
-    assert!(shown.contains("\n+ dtoverlay=pwm-2chan\n+ dtparam=audio=off\n"), "{shown}");
+    assert!(shown.contains("\n+ dtoverlay=pwm-2chan\n") && shown.contains("\n+ dtparam=audio=off\n"), "{shown}");
 }
 
 /// What editors of other systems leave.
@@ -469,6 +489,63 @@ fn a_device_that_goes_leaves_the_lines_of_the_next_one() {
     assert_eq!(config_txt, "arm_boost=1\n# pinion add bme280\n[all]\ndtparam=i2c_arm=on\n");
     card.added(&["bme280", "--yes", "--undo"]);
     assert_eq!(card.read("boot/firmware/config.txt"), "arm_boost=1\n");
+}
+
+/// All orders in which devices can go: what the others need stays, and at the end all is as it was.
+#[test]
+fn a_device_that_goes_takes_nothing_from_the_others() {
+    let armbian = ARMBIAN_ENV.replace("PREFIX", "sun50i-h616");
+    let with_overlays = format!("{armbian}overlays=ws2812 light\n");
+    let card_with = |env: &str| {
+        if env.is_empty() {
+            return Card::pi();
+        }
+        let overlay = |name: &str| format!("boot/dtb/allwinner/overlay/sun50i-h616-{name}.dtbo");
+        let (spi, i2c) = (overlay("spidev1_1"), overlay("i2c3-ph"));
+        Card::of("OrangePi Zero3", &[("boot/armbianEnv.txt", env), (&*spi, ""), (&*i2c, "")])
+    };
+    let cards: [(&str, [&[&str]; 3]); 4] = [
+        ("", [&["adxl345"], &["lis2dw"], &["bme280"]]),
+        // The second one needs a faster bus than the first one.
+        ("", [&["bme280"], &["lis2dw", "--bus", "i2c"], &["ssd1306"]]),
+        (&armbian, [&["adxl345"], &["bme280"], &["sht"]]),
+        (&with_overlays, [&["sht"], &["adxl345"], &["bme280"]]),
+    ];
+    for (env, devices) in cards {
+        for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
+            let card = card_with(env);
+            card.put("etc/modules-load.d/cups-filters.conf", "lp\n");
+            let before = card.snapshot();
+            devices.iter().for_each(|device| drop(card.added(&[*device, &["--yes"]].concat())));
+            for (done, gone) in order.iter().enumerate() {
+                let told = card.added(&[devices[*gone][0], "--undo", "--yes"]);
+                let now = card.snapshot();
+                for left in &order[done + 1..] {
+                    let again = card.added(&[devices[*left], &["--yes"]].concat());
+                    assert!(again.contains("Nothing is left to change."), "{order:?} {gone}: {told}{again}");
+                    assert_eq!(card.snapshot(), now, "{devices:?} {order:?}: {gone} goes, {left} stays");
+                }
+            }
+            assert_eq!(card.snapshot(), before, "{devices:?} {order:?}");
+        }
+    }
+}
+
+/// pinion add did not write its section.
+#[test]
+fn a_bus_that_a_section_of_the_user_needs_stays() {
+    let card = Card::pi();
+    let before = card.snapshot();
+    card.added(&["adxl345", "--yes"]);
+    let printer_cfg = card.read(PRINTER);
+    card.put(PRINTER, &format!("{printer_cfg}\n[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
+    let told = card.added(&["adxl345", "--undo", "--yes"]);
+    let keeps = "/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] in printer.cfg needs it";
+    assert!(told.contains(keeps), "{told}");
+    assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
+    card.put(PRINTER, PRINTER_CFG);
+    card.added(&["adxl345", "--undo", "--yes"]);
+    assert_eq!(card.snapshot(), before);
 }
 
 #[test]

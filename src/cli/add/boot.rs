@@ -11,19 +11,20 @@ use super::change::Splice;
 /// The values with which config.txt switches a parameter on. None is also one.
 const ON: [&str; 4] = ["on", "true", "yes", "1"];
 
-/// The lines to insert into a config.txt so that all of `wanted` are on for a board to which these sections apply.
-/// `None` if they are on already. `device` names the lines for a reader.
-pub(super) fn config_txt(text: &str, sections: &[String], device: &str, wanted: &[&str]) -> Option<Splice> {
-    let missing: Vec<&str> = wanted.iter().copied().filter(|wanted| !is_on(text, sections, wanted)).collect();
-    if missing.is_empty() {
-        return None;
-    }
+/// The insertions into a config.txt so that all of `wanted` are on for a board to which these sections apply, each with
+/// its line. Each has a section of its own, so that another device can keep it. `device` names the lines for a reader.
+pub(super) fn config_txt(text: &str, sections: &[String], device: &str, wanted: &[&str]) -> Vec<(String, Splice)> {
     let end = if text.contains("\r\n") { "\r\n" } else { "\n" };
-    let mut lines = vec![format!("# pinion add {device}"), "[all]".into()];
-    lines.extend(missing.iter().map(|line| (*line).to_owned()));
-    let before = if text.is_empty() || text.ends_with('\n') { "" } else { end };
-    let new = lines.iter().fold(before.to_owned(), |new, line| new + line + end);
-    Some(Splice { at: text.len(), old: String::new(), new })
+    let mut at = text.len();
+    let mut before = if text.is_empty() || text.ends_with('\n') { "" } else { end };
+    let mut splices = Vec::new();
+    for line in wanted.iter().filter(|line| !is_on(text, sections, line)) {
+        let new = format!("{before}# pinion add {device}{end}[all]{end}{line}{end}");
+        before = "";
+        splices.push(((*line).to_owned(), Splice::insert(at, new)));
+        at += splices.last().map_or(0, |(_, splice)| splice.new.len());
+    }
+    splices
 }
 
 /// The line that a config.txt gives to 1-Wire, if it is not the overlay's own.
@@ -78,8 +79,8 @@ fn parameter(name: &str) -> &str {
     }
 }
 
-/// The change to an armbianEnv.txt or its like so that an overlay of this bus is loaded. `files` are the names of
-/// the image's overlays, without `.dtbo`. Nothing if one is loaded already.
+/// The changes to an armbianEnv.txt or its like so that an overlay of this bus is loaded. `files` are the names of the
+/// image's overlays, without `.dtbo`. Nothing if one is loaded already.
 ///
 /// # Errors
 ///
@@ -118,13 +119,12 @@ pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>) -> Resul
             ),
         });
     };
-    let mut splices = Vec::new();
+    let mut splices = add_word(text, "overlays", name);
     let mut changed = text.to_owned();
-    for (key, value, adds) in [("overlays", name.as_str(), true)].into_iter().chain(parameters.iter().map(|line| {
+    splices.iter().for_each(|splice| splice.apply(&mut changed));
+    for line in parameters {
         let (key, value) = line.split_once('=').unwrap_or((line, ""));
-        (key, value, false)
-    })) {
-        let splice = set(&changed, key, value, adds);
+        let splice = set(&changed, key, value);
         splice.apply(&mut changed);
         splices.push(splice);
     }
@@ -145,21 +145,36 @@ fn last<'a>(text: &'a str, key: &str) -> Option<(usize, &'a str)> {
     found
 }
 
-/// Sets a key to a value, or adds the value to it.
-fn set(text: &str, key: &str, value: &str, adds: bool) -> Splice {
-    let end = if text.contains("\r\n") { "\r\n" } else { "\n" };
+/// Sets a key to a value.
+fn set(text: &str, key: &str, value: &str) -> Splice {
     match last(text, key) {
         Some((at, old)) => {
-            let new = if adds && !old.is_empty() { format!("{old} {value}") } else { value.to_owned() };
             // With the key, the text is found again even if the file has changed above it.
             let at = at - key.len() - 1;
-            Splice { at, old: format!("{key}={old}"), new: format!("{key}={new}") }
+            Splice { at, old: format!("{key}={old}"), new: format!("{key}={value}"), word: None }
         }
         None => {
+            let end = if text.contains("\r\n") { "\r\n" } else { "\n" };
             let before = if text.is_empty() || text.ends_with('\n') { "" } else { end };
-            Splice { at: text.len(), old: String::new(), new: format!("{before}{key}={value}{end}") }
+            Splice::insert(text.len(), format!("{before}{key}={value}{end}"))
         }
     }
+}
+
+/// Adds a word to the value of a key. A line that is missing is a change of its own: it stays while another device has a
+/// word in it.
+fn add_word(text: &str, key: &str, word: &str) -> Vec<Splice> {
+    let mut splices = Vec::new();
+    let mut changed = text.to_owned();
+    if last(text, key).is_none() {
+        let line = set(text, key, "");
+        line.apply(&mut changed);
+        splices.push(line);
+    }
+    let words = last(&changed, key).map_or("", |(_, words)| words);
+    let value = if words.is_empty() { word.to_owned() } else { format!("{words} {word}") };
+    splices.push(Splice { word: Some(word.to_owned()), ..set(&changed, key, &value) });
+    splices
 }
 
 #[cfg(test)]
@@ -173,13 +188,16 @@ mod tests {
 
     fn with(text: &str, sections: &[&str], wanted: &[&str]) -> Option<String> {
         let sections: Vec<String> = sections.iter().map(|section| (*section).to_owned()).collect();
-        let splice = config_txt(text, &sections, "x", wanted)?;
+        let splices = config_txt(text, &sections, "x", wanted);
         let mut changed = text.to_owned();
-        splice.apply(&mut changed);
-        assert_eq!(config_txt(&changed, &sections, "x", wanted), None, "{changed}");
-        splice.revert(&mut changed).unwrap();
+        splices.iter().for_each(|(_, splice)| splice.apply(&mut changed));
+        assert_eq!(config_txt(&changed, &sections, "x", wanted), [], "{changed}");
+        for (_, splice) in splices.iter().rev() {
+            splice.revert(&mut changed).unwrap();
+        }
         assert_eq!(changed, text);
-        Some(splice.new)
+        let new: String = splices.into_iter().map(|(_, splice)| splice.new).collect();
+        (!new.is_empty()).then_some(new)
     }
 
     #[test]

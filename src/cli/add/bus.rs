@@ -3,15 +3,21 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::catalog::{Boot, Kind};
+use super::catalog::{Boot, Bus, Device, Kind, KnownBoard};
 use super::change::{Change, Record, Splice};
+use super::printer::Printer;
 use super::{BUS, Work, boot, system};
 
 /// The file that loads the driver of /dev/i2c-*.
 const MODULES: &str = "/etc/modules-load.d/pinion-i2c-dev.conf";
+
+/// The key of the change that loads this driver.
+const I2C_DEV: &str = "i2c-dev";
+/// The key of the line of overlays, which all of them share.
+const OVERLAYS: &str = "overlays=";
 
 /// Whether a bus is there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,6 +39,33 @@ impl State {
     }
 }
 
+/// The key of the change that makes this line of config.txt, or that loads the overlay of this node.
+fn key(what: &str) -> String {
+    format!("{BUS} {what}")
+}
+
+/// The keys of the changes that enable a bus.
+fn keys(board: &KnownBoard, kind: Kind, bus: &Bus) -> Vec<String> {
+    let mut keys: Vec<String> = match board.boot {
+        Boot::ConfigTxt => bus.enable.iter().map(|line| key(line)).collect(),
+        Boot::Overlays => vec![key(&bus.node), OVERLAYS.to_owned()],
+    };
+    if kind == Kind::I2c {
+        keys.push(I2C_DEV.to_owned());
+    }
+    keys
+}
+
+/// The keys of the changes that enable buses for other sections of printer.cfg than the device's own, with the section.
+pub(super) fn in_use(board: &KnownBoard, printer: &Printer, device: &Device) -> BTreeMap<String, String> {
+    let users = board.bus.iter().filter_map(|(kind, bus)| {
+        let user = bus.spots().find_map(|spot| printer.user(device, *kind, &spot.node))?;
+        let user = format!("[{user}] in printer.cfg");
+        Some(keys(board, *kind, bus).into_iter().map(move |key| (key, user.clone())))
+    });
+    users.flatten().collect()
+}
+
 impl Work<'_> {
     /// Puts the wire of 1-Wire at the line that config.txt names.
     pub(super) fn move_w1(&mut self) -> Result<(), String> {
@@ -51,50 +84,54 @@ impl Work<'_> {
     pub(super) fn plan_boot(&self) -> Result<(Record, State), String> {
         let mut record = Record::default();
         let Some(bus) = self.board.bus.get(&self.way.bus) else { return Ok((record, State::There)) };
-        let key = format!("{BUS} {}", bus.node);
-        record.needs.push(key.clone());
+        // The driver of a chip brings its bus in its own lines.
+        let without_driver = self.way.driver.is_none();
+        if without_driver {
+            record.needs = keys(self.board, self.way.bus, bus);
+        }
+        record.needs.extend(self.way.config_txt.iter().map(|line| key(line)));
         let is_there = self.is_there(self.node());
         let file = self.computer.first(&self.board.files.iter().map(String::as_str).collect::<Vec<_>>());
         let side = system(self.computer);
         let mut wanted: Vec<&str> = Vec::new();
         // A bus that is there stays as it is: the user may have enabled it.
         // But LEDs also need a clock that stays.
-        if self.way.driver.is_none() && (!is_there || self.way.bus == Kind::Leds) {
+        if without_driver && (!is_there || self.way.bus == Kind::Leds) {
             wanted.extend(bus.enable.iter().map(String::as_str));
         }
-        if self.way.driver.is_none() || !is_there {
+        if without_driver || !is_there {
             wanted.extend(self.way.config_txt.iter().map(String::as_str));
         }
-        let splices = match (self.board.boot, file) {
+        let splices: Vec<(String, Splice)> = match (self.board.boot, file) {
             (Boot::ConfigTxt, Some(file)) if !wanted.is_empty() => {
                 let text = side.read(Path::new(file))?.unwrap_or_default();
-                boot::config_txt(&text, &self.board.sections, self.device.name, &wanted).into_iter().collect()
+                let lines = boot::config_txt(&text, &self.board.sections, self.device.name, &wanted);
+                lines.into_iter().map(|(line, splice)| (key(&line), splice)).collect()
             }
             (Boot::Overlays, Some(file)) if !is_there => {
                 let text = side.read(Path::new(file))?.unwrap_or_default();
-                boot::overlays(&text, bus, &self.overlays()).map_err(|why| format!("{file}: {why}"))?
+                let splices = boot::overlays(&text, bus, &self.overlays()).map_err(|why| format!("{file}: {why}"))?;
+                let is_line = |splice: &Splice| splice.new.trim() == OVERLAYS;
+                let key_of = |splice: &Splice| if is_line(splice) { OVERLAYS.to_owned() } else { key(&bus.node) };
+                splices.into_iter().map(|splice| (key_of(&splice), splice)).collect()
             }
             (_, None) if !is_there => {
                 return Err(format!("none of {} is there: enable {} by hand", self.board.files.join(", "), bus.node));
             }
             _ => Vec::new(),
         };
-        let change = |splice| Change { key: key.clone(), file: file.unwrap_or_default().into(), makes: false, splice };
+        let change = |(key, splice)| Change { key, file: file.unwrap_or_default().into(), makes: false, splice };
         record.changes.extend(splices.into_iter().map(change));
         if is_there && record.changes.is_empty() {
             return Ok((record, State::There));
         }
         let mut state = State::Due;
         if self.way.bus == Kind::I2c && !is_there && self.needs_i2c_dev()? {
-            let new = "# Written by pinion add: /dev/i2c-*\ni2c-dev\n".to_owned();
-            let splice = Splice { at: 0, old: String::new(), new };
+            let splice = Splice::insert(0, "# Written by pinion add: /dev/i2c-*\ni2c-dev\n".to_owned());
             if record.changes.is_empty() && self.computer.path(format!("/sys/bus/i2c/devices/{}", bus.node)).exists() {
                 state = State::NotLoaded;
             }
-            record.changes.push(Change { key: "i2c-dev".into(), file: MODULES.into(), makes: true, splice });
-        }
-        if self.way.bus == Kind::I2c {
-            record.needs.push("i2c-dev".into());
+            record.changes.push(Change { key: I2C_DEV.to_owned(), file: MODULES.into(), makes: true, splice });
         }
         Ok((record, state))
     }

@@ -124,15 +124,10 @@ pub(super) enum Check {
         bits: Vec<u8>,
         #[serde(default)]
         faults: Vec<Fault>,
+        detect: Option<Detect>,
     },
-    /// An I2C chip acknowledges and answers, with a CRC behind two bytes if it says so.
-    Answer {
-        #[serde(default)]
-        write: Vec<u8>,
-        bytes: usize,
-        #[serde(default)]
-        crc: bool,
-    },
+    /// An I2C chip without an id answers each of these reads.
+    Reads { reads: Vec<Read> },
     /// An I2C chip answers a temperature in 1/256 degrees.
     Temperature { write: Vec<u8>, bytes: usize },
     /// The kernel has found a thermometer.
@@ -141,14 +136,46 @@ pub(super) enum Check {
     Iio { file: String, highest: u32 },
 }
 
+/// A read of an I2C chip.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Read {
+    /// A register, or a command.
+    pub(super) write: Vec<u8>,
+    /// How long the command takes. Without it, the answer follows a repeated start.
+    #[serde(default)]
+    pub(super) wait_ms: u64,
+    /// The bits of the answer that are known.
+    pub(super) mask: Vec<u8>,
+    pub(super) bits: Vec<u8>,
+    /// The last byte is a CRC, which begins with this value.
+    pub(super) crc: Option<u8>,
+}
+
 /// A bit by which a chip reports a fault.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Fault {
     /// The byte of the answer.
+    #[serde(default)]
     pub(super) byte: usize,
     pub(super) bit: u8,
     pub(super) meaning: String,
+}
+
+/// The detection of faults by an SPI chip that only does it when it is told to.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Detect {
+    /// The register that switches it on, and gets its old value back.
+    pub(super) register: u8,
+    /// The bits that switch it on.
+    pub(super) set: u8,
+    /// How long it takes.
+    pub(super) wait_ms: u64,
+    /// The register with the faults.
+    pub(super) status: u8,
+    pub(super) faults: Vec<Fault>,
 }
 
 /// A board.
@@ -313,6 +340,11 @@ impl KnownBoard {
         self.lines.get(&pin.to_string()).map(String::as_str)
     }
 
+    /// The places on the header for a device that is connected in this way, the best one first.
+    pub(super) fn spots(&self, way: &Way) -> impl Iterator<Item = Spot> {
+        self.bus.get(&way.bus).into_iter().flat_map(Bus::spots)
+    }
+
     /// A place on the header for a device that is connected in this way. `uses` says whether printer.cfg uses a node for
     /// another device.
     ///
@@ -320,13 +352,15 @@ impl KnownBoard {
     ///
     /// One line: another device is there.
     pub(super) fn spot(&self, way: &Way, uses: &dyn Fn(Kind, &str) -> Option<String>) -> Result<Spot, String> {
-        let Some(bus) = self.bus.get(&way.bus) else { return Ok(Spot::default()) };
+        if !self.bus.contains_key(&way.bus) {
+            return Ok(Spot::default());
+        }
         let controller = |node: &str| node.split('.').next().unwrap_or_default().to_owned();
         let is_shared = way.bus == Kind::I2c || way.bus == Kind::W1;
         // LEDs and an HX711 take every transfer on the data output for theirs.
         let is_alone = way.bus == Kind::Leds || way.bus == Kind::Spi && !way.wires.iter().any(|(_, role)| role == "cs");
         let mut refusal = String::new();
-        for spot in bus.spots() {
+        for spot in self.spots(way) {
             let others = self.bus.iter().flat_map(|(kind, other)| other.spots().map(move |other| (*kind, other)));
             let mut others = others.filter(|(kind, _)| *kind != way.bus || !is_shared);
             let conflict = others.find_map(|(kind, other)| {
@@ -342,7 +376,7 @@ impl KnownBoard {
                 Some(conflict) => refusal = conflict,
             }
         }
-        Err(format!("{refusal}: pins.md says how chips share a bus (docs/guide/pins.md)"))
+        Err(refusal)
     }
 
     /// The wires to make. `taken` are lines that are in use. `wanted` is the pin that the user has chosen for the first
@@ -450,9 +484,18 @@ mod tests {
                 assert_eq!(way.bus == Kind::I2c, !way.addresses.is_empty(), "{}", device.name);
                 let is_asked = way.bus == Kind::Spi && way.check.is_some() && way.driver.is_none();
                 assert!(!is_asked || way.rate_hz >= 100_000, "{}", device.name);
-                if let Some(Check::Fixed { mask, bits, faults, .. }) = &way.check {
-                    let fits = mask.len() == bits.len() && mask.iter().zip(bits).all(|(mask, bits)| bits & !mask == 0);
-                    assert!(fits && faults.iter().all(|fault| fault.byte < mask.len()), "{}", device.name);
+                let fits = |mask: &[u8], bits: &[u8]| {
+                    mask.len() == bits.len() && mask.iter().zip(bits).all(|(mask, bits)| bits & !mask == 0)
+                };
+                match &way.check {
+                    Some(Check::Fixed { mask, bits, faults, .. }) => {
+                        let has_byte = faults.iter().all(|fault| fault.byte < mask.len());
+                        assert!(fits(mask, bits) && has_byte, "{}", device.name);
+                    }
+                    Some(Check::Reads { reads }) => {
+                        assert!(reads.iter().all(|read| fits(&read.mask, &read.bits)), "{}", device.name);
+                    }
+                    _ => {}
                 }
                 // Every device can be added to a Raspberry Pi 4.
                 let wires = catalog.boards[1]

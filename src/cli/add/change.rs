@@ -10,6 +10,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, fchown};
@@ -32,9 +33,18 @@ pub(super) struct Splice {
     pub(super) at: usize,
     pub(super) old: String,
     pub(super) new: String,
+    /// The word that `new`, a line of a key and words, has more than `old`. Only this word is taken back: others may
+    /// have come since.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) word: Option<String>,
 }
 
 impl Splice {
+    /// An insertion.
+    pub(super) fn insert(at: usize, new: String) -> Splice {
+        Splice { at, old: String::new(), new, word: None }
+    }
+
     /// Makes the change in the text that it was planned for.
     pub(super) fn apply(&self, text: &mut String) {
         text.replace_range(self.at..self.at + self.old.len(), &self.new);
@@ -46,6 +56,9 @@ impl Splice {
     ///
     /// The new text is there several times, and which one is ours cannot be known.
     pub(super) fn revert(&self, text: &mut String) -> Result<bool, String> {
+        if let (Some(word), Some((key, _))) = (&self.word, self.new.split_once('=')) {
+            return Ok(remove_word(text, key, word));
+        }
         let is_whole_line = |at: usize| at == 0 || self.new.starts_with(['\r', '\n']) || text[..at].ends_with('\n');
         let at = if text.get(self.at..).is_some_and(|rest| rest.starts_with(&self.new)) {
             self.at
@@ -64,6 +77,33 @@ impl Splice {
         text.replace_range(at + kept..at + self.new.len(), &self.old);
         Ok(true)
     }
+}
+
+/// Removes a word, with the space before it, from the last line with this key that has it. False if there is none.
+fn remove_word(text: &mut String, key: &str, word: &str) -> bool {
+    let mut line_at = 0;
+    let mut found = None;
+    for line in text.split_inclusive('\n') {
+        if let Some(words) = line.strip_prefix(key).and_then(|rest| rest.strip_prefix('=')) {
+            let is_end = |rest: Option<char>| rest.is_none_or(char::is_whitespace);
+            let is_word = |at: &usize| {
+                is_end(words[..*at].chars().next_back()) && is_end(words[*at + word.len()..].chars().next())
+            };
+            let at = words.match_indices(word).map(|(at, _)| at).find(is_word);
+            found = at.map(|at| line_at + key.len() + 1 + at).or(found);
+        }
+        line_at += line.len();
+    }
+    let Some(at) = found else { return false };
+    let end = at + word.len();
+    let is_before_another = text[end..].strip_prefix(' ').is_some_and(|rest| !rest.starts_with(char::is_whitespace));
+    let (at, end) = match (text[..at].ends_with(' '), is_before_another) {
+        (true, _) => (at - 1, end),
+        (false, true) => (at, end + 1),
+        (false, false) => (at, end),
+    };
+    text.replace_range(at..end, "");
+    true
 }
 
 /// A change of one file.
@@ -217,6 +257,11 @@ impl Side<'_> {
             .map_err(|error| format!("{}: it is no record of pinion add: {error}: remove it", file.display()))
     }
 
+    fn write_record(&self, device: &str, record: &Record) -> Result<(), String> {
+        let text = serde_json::to_string_pretty(record).map_err(|error| error.to_string())?;
+        self.write(&self.record_of(device), &(text + "\n"))
+    }
+
     /// Makes the changes, and records them first. Each file that is changed is copied before, byte for byte.
     ///
     /// # Errors
@@ -230,8 +275,7 @@ impl Side<'_> {
         let mut record = old.clone().unwrap_or_default();
         record.extend(new.clone());
         if old.as_ref() != Some(&record) {
-            let text = serde_json::to_string_pretty(&record).map_err(|error| error.to_string())?;
-            self.write(&self.record_of(device), &(text + "\n"))?;
+            self.write_record(device, &record)?;
         }
         for file in files(&new.changes) {
             let own = new.changes.iter().filter(|change| change.file == file);
@@ -252,40 +296,55 @@ impl Side<'_> {
         Ok(())
     }
 
-    /// Takes a device's changes back. A change that another one of `devices` needs becomes that device's. Returns a
-    /// line for each thing that was left.
+    /// Takes a device's changes back. A change that one of the `heirs`, other devices with the keys that they need, needs
+    /// becomes that device's. A change whose key is in `in_use`, with its user, stays this device's. Returns a line for
+    /// each thing that was left.
     ///
     /// # Errors
     ///
     /// One line with the file and the cause. Another call takes the others back.
-    pub(super) fn undo(&self, device: &str, devices: &[&str]) -> Result<Vec<String>, String> {
+    pub(super) fn undo(
+        &self,
+        device: &str,
+        heirs: &[(&str, BTreeSet<String>)],
+        in_use: &BTreeMap<String, String>,
+    ) -> Result<Vec<String>, String> {
         let mut left = Vec::new();
         let Some(record) = self.record(device)? else { return Ok(left) };
         for file in files(&record.changes) {
             self.refuse_read_only(&file)?;
         }
-        let mut kept = Vec::new();
-        for other in devices.iter().filter(|other| **other != device) {
-            let Some(mut heir) = self.record(other)? else { continue };
-            let inherited =
-                record.changes.iter().filter(|change| heir.needs.contains(&change.key) && !kept.contains(*change));
-            let inherited: Vec<Change> = inherited.cloned().collect();
+        let all = files(&record.changes);
+        let mut rest = record.changes;
+        for (heir, needs) in heirs {
+            let inherited: Vec<Change> = rest.extract_if(.., |change| needs.contains(&change.key)).collect();
             if !inherited.is_empty() {
-                kept.extend(inherited.iter().cloned());
-                heir.extend(Record { changes: inherited, needs: Vec::new() });
-                let text = serde_json::to_string_pretty(&heir).map_err(|error| error.to_string())?;
-                self.write(&self.record_of(other), &(text + "\n"))?;
+                // The heir found them made, so its own changes are the later ones.
+                let mut record = Record { changes: inherited, needs: Vec::new() };
+                record.extend(self.record(heir)?.unwrap_or_default());
+                self.write_record(heir, &record)?;
             }
         }
-        for file in files(&record.changes) {
-            let own: Vec<&Change> = record.changes.iter().filter(|change| change.file == file).collect();
-            let own: Vec<&Change> = own.into_iter().filter(|change| !kept.contains(*change)).collect();
+        let stays: Vec<Change> = rest.extract_if(.., |change| in_use.contains_key(&change.key)).collect();
+        for Change { key, file, splice, .. } in &stays {
+            let (file, user) = (file.display(), in_use.get(key).map_or("", String::as_str));
+            let line = splice.new.trim().lines().next_back().unwrap_or_default();
+            left.push(format!("{file} keeps \"{line}\": {user} needs it. Call this again when it does not"));
+        }
+        for file in all {
+            let own: Vec<&Change> = rest.iter().filter(|change| change.file == file).collect();
             let before = left.len();
             self.undo_file(&file, &own, &mut left)?;
-            self.drop_copy(&file, device, left.len() == before, &mut left)?;
+            if !stays.iter().any(|change| change.file == file) {
+                self.drop_copy(&file, device, left.len() == before, &mut left)?;
+            }
         }
-        self.remove(&self.record_of(device))?;
-        self.tidy(&self.records);
+        if stays.is_empty() {
+            self.remove(&self.record_of(device))?;
+            self.tidy(&self.records);
+        } else {
+            self.write_record(device, &Record { changes: stays, needs: record.needs })?;
+        }
         Ok(left)
     }
 
@@ -403,8 +462,12 @@ mod tests {
     use proptest::prelude::*;
     use std::os::unix::fs::symlink;
 
+    fn splice(at: usize, old: &str, new: &str) -> Splice {
+        Splice { at, old: old.into(), new: new.into(), word: None }
+    }
+
     fn change(key: &str, file: &str, makes: bool, at: usize, old: &str, new: &str) -> Change {
-        Change { key: key.into(), file: file.into(), makes, splice: Splice { at, old: old.into(), new: new.into() } }
+        Change { key: key.into(), file: file.into(), makes, splice: splice(at, old, new) }
     }
 
     /// All files below a folder with their bytes and modes.
@@ -443,14 +506,20 @@ mod tests {
         side.make("a", &Record { changes: vec![own("a"), shared.clone()], needs: needs() }).unwrap();
         side.make("b", &Record { changes: vec![own("b")], needs: needs() }).unwrap();
         assert_eq!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap(), "[include pinion/*.cfg]\n[mcu]\n");
-        let all = ["a", "b", "c"];
-        side.undo("a", &all).unwrap();
+        let none = BTreeMap::new();
+        side.undo("a", &[("b", needs().into_iter().collect())], &none).unwrap();
         assert!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap().starts_with("[include"), "b needs it");
         assert!(side.read(Path::new("/home/pinion/a.cfg")).unwrap().is_none());
-        side.undo("b", &all).unwrap();
+        // A section of the user's needs it.
+        let left = side.undo("b", &[], &[("include".into(), "[x]".into())].into()).unwrap();
+        let keeps =
+            "/home/printer.cfg keeps \"[include pinion/*.cfg]\": [x] needs it. Call this again when it does not";
+        assert_eq!(left, [keeps]);
+        assert!(side.read(Path::new("/home/pinion/b.cfg")).unwrap().is_none());
+        assert_eq!(side.undo("b", &[], &none), Ok(vec![]));
         assert_eq!(snapshot(&computer.path("/")), before);
         assert!(!computer.path("/home/pinion").exists());
-        assert_eq!(side.undo("b", &all), Ok(vec![]), "a second time does nothing");
+        assert_eq!(side.undo("b", &[], &none), Ok(vec![]), "a second time does nothing");
     }
 
     #[test]
@@ -469,18 +538,18 @@ mod tests {
         side.make("a", &record).unwrap();
         tree.put("home/printer.cfg", "# mine\n[i]\n[mcu]\n#*# saved\n");
         tree.put("home/pinion/a.cfg", "[a]\nmine: 1\n");
-        let left = side.undo("a", &["a"]).unwrap();
+        let left = side.undo("a", &[], &BTreeMap::new()).unwrap();
         assert_eq!(left.len(), 1, "{left:?}");
         assert!(left[0].starts_with("/home/pinion/a.cfg was changed since"), "{left:?}");
         assert!(!computer.path("/home/printer.cfg.before-add-a").exists());
         assert_eq!(side.read(Path::new("/home/printer.cfg")).unwrap().unwrap(), "# mine\n[mcu]\n#*# saved\n");
-        let splice = Splice { at: 3, old: String::new(), new: "\nours\n".into() };
+        let ours = splice(3, "", "\nours\n");
         for (text, left) in [("a=b\nours\n", "a=b"), ("a=b\nours\ntheirs\n", "a=b\ntheirs\n")] {
             let mut text = text.to_owned();
-            assert_eq!(splice.revert(&mut text), Ok(true));
+            assert_eq!(ours.revert(&mut text), Ok(true));
             assert_eq!(text, left);
         }
-        let splice = Splice { at: 9, old: String::new(), new: "x=1\n".into() };
+        let splice = splice(9, "", "x=1\n");
         assert!(splice.revert(&mut "x=1\nx=1\n".into()).unwrap_err().contains("several times"));
         assert_eq!(splice.revert(&mut "yx=1\n".into()), Ok(false), "it is part of another line");
     }
@@ -528,7 +597,7 @@ mod tests {
         fs::set_permissions(&printer_cfg, Permissions::from_mode(0o644)).unwrap();
         side.make("a", &record).unwrap();
         fs::set_permissions(&printer_cfg, Permissions::from_mode(0o444)).unwrap();
-        assert_eq!(side.undo("a", &["a"]).unwrap_err(), refusal);
+        assert_eq!(side.undo("a", &[], &BTreeMap::new()).unwrap_err(), refusal);
         assert!(side.record("a").unwrap().is_some());
     }
 
@@ -548,7 +617,7 @@ mod tests {
             let computer = tree.computer();
             let side = side(&computer);
             side.make("a", &record).unwrap();
-            prop_assert_eq!(side.undo("a", &["a"]).unwrap(), Vec::<String>::new());
+            prop_assert_eq!(side.undo("a", &[], &BTreeMap::new()).unwrap(), Vec::<String>::new());
             prop_assert_eq!(snapshot(&computer.path("/")), before);
         }
     }

@@ -15,6 +15,9 @@ use super::catalog::{Check, KnownBoard, Spot};
 use super::printer::Printer;
 use super::probe::{self, Answer};
 
+/// How often a chip's driver is asked for a value.
+const SAMPLES: usize = 8;
+
 impl Work<'_> {
     /// Asks the device. Returns its I2C address.
     pub(super) fn check(&mut self, printer: Option<&Printer>) -> Result<Option<u8>, String> {
@@ -60,15 +63,11 @@ impl Work<'_> {
     /// Reads a value of the chip by its driver, which does not know whether the chip is there.
     fn sample(&self, file: &str, highest: u32) -> Result<Answer, String> {
         let folder = self.iio().ok_or("its driver has gone: reboot")?;
-        let value = self.computer.text(self.computer.name(&folder.join(file)));
-        let value: u32 = value.and_then(|text| text.parse().ok()).ok_or_else(|| format!("{file} cannot be read"))?;
-        match value {
-            0 => Err(format!("{file} is 0: no power, DOUT is not connected, or the input touches ground")),
-            _ if value >= highest => {
-                Err(format!("{file} is {value}, the highest value: no ground, or nothing is connected at the input"))
-            }
-            _ => Ok(Answer { text: format!("{file} is {value} of {highest}"), address: None }),
-        }
+        let path = self.computer.name(&folder.join(file));
+        let read = |_| self.computer.text(&path)?.parse().ok();
+        let values: Option<Vec<u32>> = (0..SAMPLES).map(read).collect();
+        let values = values.ok_or_else(|| format!("{file} cannot be read"))?;
+        judge(file, &values, highest).map(|text| Answer { text, address: None })
     }
 
     /// The folder of the device of the chip's driver.
@@ -86,6 +85,21 @@ impl Work<'_> {
         let names = found.iter().filter_map(|path| path.file_name()?.to_str());
         let is_serial = |name: &&str| name.chars().all(|c| c.is_ascii_hexdigit() || c == '-');
         names.filter(is_serial).find(|name| !known.contains(name)).map(str::to_owned)
+    }
+}
+
+/// The meaning of the values that a chip's driver has read.
+fn judge(file: &str, values: &[u32], highest: u32) -> Result<String, String> {
+    let least = values.iter().copied().min().unwrap_or_default();
+    let most = values.iter().copied().max().unwrap_or_default();
+    // A thermistor's voltage hardly changes between two reads, and a loose data wire is noise.
+    match (least, most) {
+        (_, 0) => Err(format!("{file} is 0: no power, DOUT is not connected, or the input touches ground")),
+        _ if least >= highest => {
+            Err(format!("{file} is {most}, the highest value: no ground, or nothing is connected at the input"))
+        }
+        _ if most - least > highest / 8 => Err(format!("{file} changes from {least} to {most}: a wire is loose")),
+        _ => Ok(format!("{file} is {most} of {highest}")),
     }
 }
 
@@ -120,6 +134,19 @@ mod tests {
     use super::*;
     use crate::cli::add::catalog::Catalog;
     use crate::cli::computer::tests::Tree;
+
+    #[test]
+    fn an_adc_that_is_not_there_is_known_by_its_values() {
+        assert_eq!(judge("x", &[2000, 2040, 1990], 4095).unwrap(), "x is 2040 of 4095");
+        assert_eq!(judge("x", &[0, 3], 4095).unwrap(), "x is 3 of 4095", "a cold thermistor");
+        for (values, words) in [
+            (&[0, 0][..], "x is 0: no power"),
+            (&[4095, 4095], "x is 4095, the highest value"),
+            (&[1000, 3000, 4095], "x changes from 1000 to 4095: a wire is loose"),
+        ] {
+            assert!(judge("x", values, 4095).unwrap_err().starts_with(words), "{values:?}");
+        }
+    }
 
     #[test]
     fn a_pin_of_the_bus_that_another_program_has_switched_is_named() {

@@ -126,30 +126,71 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
         return undo::undo(args, computer, &catalog, device, report);
     }
     let board = board.ok_or_else(|| list::unknown_board(&model))?;
-    let way = chosen(board, device, args.bus.as_deref())?;
-    let mut work = Work { args, computer, catalog: &catalog, board, device, way, spot: Spot::default(), report };
-    work.run()
+    let ways = ways(board, device, args.bus.as_deref())?;
+    let printer = Printer::find(computer, args.config.as_deref());
+    if args.config.is_some() {
+        printer.as_ref().map_err(String::clone)?;
+    }
+    let (way, spot) = place(board, device, &ways, printer.as_ref().ok(), report)?;
+    let mut work = Work { args, computer, catalog: &catalog, board, device, way, spot, report };
+    work.run(printer)
 }
 
-/// The way to connect a device: the one that is named, or the first one that the board has.
-fn chosen<'a>(board: &KnownBoard, device: &'a Device, wanted: Option<&str>) -> Result<&'a Way, String> {
-    let mut ways = device.way.iter().filter(|way| match wanted.map(str::to_ascii_lowercase).as_deref() {
+/// The ways to connect a device to this board, the best one first: all of them, or the one that is named.
+fn ways<'a>(board: &KnownBoard, device: &'a Device, wanted: Option<&str>) -> Result<Vec<&'a Way>, String> {
+    let wanted = wanted.map(str::to_ascii_lowercase);
+    let is_wanted = |way: &&Way| match wanted.as_deref() {
         None => true,
         Some("spi") => way.bus == Kind::Spi,
         Some("i2c") => way.bus == Kind::I2c,
         Some(_) => false,
-    });
+    };
     let kinds: Vec<&str> = device.way.iter().map(|way| way.bus.name()).collect();
-    if ways.clone().next().is_none() {
+    let ways: Vec<&Way> = device.way.iter().filter(is_wanted).collect();
+    if ways.is_empty() {
         return Err(format!("--bus: {} is connected by {}", device.name, kinds.join(" or ")));
     }
-    ways.find(|way| board.has(way)).ok_or_else(|| {
-        format!(
+    let ways: Vec<&Way> = ways.into_iter().filter(|way| board.has(way)).collect();
+    match ways.is_empty() {
+        false => Ok(ways),
+        true => Err(format!(
             "{} has no known {} on its header: see docs/guide/pins.md for what you can do by hand",
             board.name,
             kinds.join(" or ")
-        )
-    })
+        )),
+    }
+}
+
+/// The way and the place of a device: those of an earlier call, or the first ones that are free.
+fn place<'a>(
+    board: &KnownBoard,
+    device: &Device,
+    ways: &[&'a Way],
+    printer: Option<&Printer>,
+    report: &mut Report,
+) -> Result<(&'a Way, Spot), String> {
+    let all = ways.iter().flat_map(|way| board.spots(way).map(move |spot| (*way, spot)));
+    if let Some(printer) = printer
+        && let Some(found) = all.into_iter().find(|(way, spot)| printer.has_placed(device, way.bus, &spot.node))
+    {
+        return Ok(found);
+    }
+    let uses = |kind: Kind, node: &str| printer?.user(device, kind, node);
+    let mut refusal = None;
+    for way in ways {
+        match board.spot(way, &uses) {
+            Ok(spot) => {
+                if let Some(why) = refusal {
+                    report.set("conflict", json!(why));
+                    report.line(format_args!("{why}: so it is connected by {}.", way.bus.name()));
+                    report.line("");
+                }
+                return Ok((way, spot));
+            }
+            Err(why) => refusal = refusal.or(Some(why)),
+        }
+    }
+    Err(format!("{}: pins.md says how chips share a bus (docs/guide/pins.md)", refusal.unwrap_or_default()))
 }
 
 /// The sides of the computer: root's files, and those of printer.cfg's owner.
@@ -211,16 +252,9 @@ struct Work<'a> {
 }
 
 impl Work<'_> {
-    fn run(&mut self) -> Result<(), String> {
-        let printer = Printer::find(self.computer, self.args.config.as_deref());
-        let (printer, no_printer) = match printer {
-            Ok(printer) => (Some(printer), None),
-            Err(why) if self.args.config.is_some() => return Err(why),
-            Err(why) => (None, Some(why)),
-        };
+    /// Does it. Without a printer, all but its configuration.
+    fn run(&mut self, printer: Result<Printer, String>) -> Result<(), String> {
         let taken = printer.as_ref().map(|printer| printer.taken(self.device)).unwrap_or_default();
-        let uses = |kind: Kind, node: &str| printer.as_ref()?.user(self.device, kind, node);
-        self.spot = self.board.spot(self.way, &uses)?;
         self.move_w1()?;
         let wires = self.board.wires(self.way, &self.spot, &taken, self.args.pin)?;
         self.draw(&wires)?;
@@ -246,21 +280,15 @@ impl Work<'_> {
                 self.report.line(format_args!("Then call \"{}\" again.", self.command()));
                 return Ok(());
             }
-        } else if !self.args.dry_run && !boot.needs.is_empty() && self.computer.is_this() {
-            // It was there before, and another device's --undo must not take it away.
-            self.note(&boot)?;
         }
         if self.computer.is_this() && state == State::Due && boot.changes.is_empty() {
             return Err(format!("{} is enabled and not there: sudo reboot, then call this again", self.node()));
         }
         let address = match self.computer.is_this() && state == State::There && may_ask {
-            true => self.check(printer.as_ref())?,
+            true => self.check(printer.as_ref().ok())?,
             false => None,
         };
-        let Some(printer) = printer else {
-            return Err(no_printer.unwrap_or_default());
-        };
-        self.configure(&printer, &wires, address)
+        self.configure(&printer?, &wires, address, boot.needs)
     }
 
     /// The command that continues.
@@ -294,8 +322,14 @@ impl Work<'_> {
         self.report.show()
     }
 
-    /// Writes the sections, and has the host read them.
-    fn configure(&mut self, printer: &Printer, wires: &[Wire], address: Option<u8>) -> Result<(), String> {
+    /// Writes the sections, and has the host read them. `boot` are the keys of what the device needs of the boot loader.
+    fn configure(
+        &mut self,
+        printer: &Printer,
+        wires: &[Wire],
+        address: Option<u8>,
+        boot: Vec<String>,
+    ) -> Result<(), String> {
         let side = host(self.computer, printer);
         let link = printer.link();
         if self.computer.is_this() && !self.args.dry_run && !link.exists() {
@@ -317,7 +351,9 @@ impl Work<'_> {
         let mut is_changed = false;
         if is_own {
             let sections = self.sections(printer, wires, address)?;
-            let (changes, needs) = printer.plan(&side, self.device, &sections)?;
+            let (changes, mut needs) = printer.plan(&side, self.device, &sections)?;
+            // Recorded here, where no root is needed: another device may have made these changes.
+            needs.extend(boot);
             let record = Record { changes, needs };
             is_changed = !record.changes.is_empty();
             if is_changed {
@@ -407,21 +443,5 @@ impl Work<'_> {
             self.report.line(format_args!("{} is a copy of what was there.", copy.display()));
         }
         Ok(())
-    }
-
-    /// Records what the device needs, if others have made it.
-    fn note(&self, record: &Record) -> Result<(), String> {
-        let side = system(self.computer);
-        if !geteuid().is_root() {
-            return Ok(());
-        }
-        let known = side.record(self.device.name)?.unwrap_or_default();
-        let is_known = record.needs.iter().all(|need| known.needs.contains(need));
-        // Nobody else's change is there to keep.
-        let is_shared = self.catalog.devices.iter().any(|other| {
-            let record = side.record(other.name).ok().flatten();
-            other.name != self.device.name && record.is_some_and(|record| !record.changes.is_empty())
-        });
-        if is_known || !is_shared { Ok(()) } else { side.make(self.device.name, record) }
     }
 }

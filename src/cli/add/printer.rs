@@ -117,6 +117,19 @@ fn link_to(computer: &Computer, file: &Path) -> Option<PathBuf> {
     configs(computer).into_iter().find(is_it)
 }
 
+/// Whether a section uses this node of a bus.
+fn uses(section: &Section, kind: Kind, node: &str) -> bool {
+    let name = node.replacen("i2c-", "i2c.", 1);
+    section.settings().iter().any(|setting| {
+        let value = name_of(&setting.value);
+        // The driver of an ADC takes the first chip select.
+        kind == Kind::W1 && setting.key == "serial_no"
+            || value == name
+            || value.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('/'))
+            || node == "spidev0.0" && value.starts_with("mcp3208/")
+    })
+}
+
 impl Printer {
     /// Finds printer.cfg as [`find`] does, and reads it. klippy may name a file by a link.
     ///
@@ -208,17 +221,14 @@ impl Printer {
 
     /// The section other than the device's own that uses this node of a bus.
     pub(super) fn user(&self, device: &Device, kind: Kind, node: &str) -> Option<String> {
-        let name = node.replacen("i2c-", "i2c.", 1);
-        let is_it = |setting: &Setting| {
-            let value = name_of(&setting.value);
-            // The driver of an ADC takes the first chip select.
-            kind == Kind::W1 && setting.key == "serial_no"
-                || value == name
-                || value.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('/'))
-                || node == "spidev0.0" && value.starts_with("mcp3208/")
-        };
-        let mut others = self.others(device);
-        others.find(|section| section.settings().iter().any(is_it)).map(|section| section.name.clone())
+        self.others(device).find(|section| uses(section, kind, node)).map(|section| section.name.clone())
+    }
+
+    /// Whether the device's own file, which an earlier call has written, uses this node of a bus.
+    pub(super) fn has_placed(&self, device: &Device, kind: Kind, node: &str) -> bool {
+        let own = self.file(device.name);
+        let mut sections = self.config.sections().iter();
+        sections.any(|section| self.config.files_of(&section.name).any(|file| file == own) && uses(section, kind, node))
     }
 
     /// The serial numbers that thermometers of printer.cfg have, without the device's own.
@@ -278,8 +288,7 @@ impl Printer {
         let mut make = |key: &str, file: PathBuf, text: String| -> Result<(), String> {
             // A file that is there is left as it is: the user may have changed it.
             if side.read(&file)?.is_none() {
-                let splice = Splice { at: 0, old: String::new(), new: text };
-                changes.push(Change { key: key.to_owned(), file, makes: true, splice });
+                changes.push(Change { key: key.to_owned(), file, makes: true, splice: Splice::insert(0, text) });
             }
             Ok(())
         };
@@ -328,7 +337,7 @@ impl Printer {
         }
         let is_open = !self.text[..place].is_empty() && !self.text[..place].ends_with('\n');
         let before = if is_open { end } else { "" };
-        Splice { at: place, old: String::new(), new: format!("{before}[include pinion/*.cfg]{end}") }
+        Splice::insert(place, format!("{before}[include pinion/*.cfg]{end}"))
     }
 }
 

@@ -3,11 +3,14 @@
 
 #![forbid(unsafe_code)]
 
+use std::thread;
+use std::time::Duration;
+
 use pinion_firmware::board::{Board as _, BusDevice, BusError, BusStatus, I2cConfig, SpiConfig};
 use pinion_linux::LinuxBoard;
 use pinion_linux::gpio::FastGpio;
 
-use super::catalog::{Catalog, Check, Fault, Kind, Way};
+use super::catalog::{Catalog, Check, Detect, Fault, Kind, Read, Way};
 
 /// How often a register is read. A loose wire answers differently each time.
 const READS: usize = 8;
@@ -15,8 +18,8 @@ const READS: usize = 8;
 const I2C_RATE_HZ: u32 = 100_000;
 /// The temperatures that a thermometer can report, in degrees Celsius.
 const TEMPERATURES: std::ops::RangeInclusive<f64> = -40.0..=150.0;
-/// The bit of an SPI chip's register address that means reading.
-const SPI_READ: u8 = 0x80;
+/// The bit of an SPI chip's register address that means reading. The MAX31856 and MAX31865 write with it.
+const HIGH_BIT: u8 = 0x80;
 
 /// The answers of a device.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,6 +45,11 @@ pub(super) trait Buses {
     ///
     /// One line with cause and remedy.
     fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String>;
+
+    /// Gives a chip time.
+    fn wait(&mut self, time: Duration) {
+        thread::sleep(time);
+    }
 }
 
 /// The buses of this computer.
@@ -90,15 +98,17 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
         let mut device = buses.spi(way)?;
         return match check {
             Check::Id { register, ids } => {
-                let mut read = || exchange(&mut *device, Some(*register), 1).map(|bytes| bytes[0]);
+                let mut read = || exchange(&mut *device, &[register | HIGH_BIT], 1).map(|bytes| bytes[0]);
                 // A chip that speaks I2C until the first edge of its chip select answers nothing here.
                 read()?;
                 let answers = (0..READS).map(|_| read()).collect::<Result<Vec<u8>, String>>()?;
                 judge(catalog, Kind::Spi, *register, ids, &answers).map(|text| Answer { text, address: None })
             }
-            Check::Fixed { register, mask, bits, faults } => {
-                let answer = exchange(&mut *device, *register, mask.len())?;
-                fixed(&answer, mask, bits, faults).map(|text| Answer { text, address: None })
+            Check::Fixed { register, mask, bits, faults, detect } => {
+                let answer = exchange(&mut *device, register.as_slice(), mask.len())?;
+                let text = fixed(&answer, mask, bits, faults)?;
+                detect.iter().try_for_each(|detect| detected(buses, &mut *device, detect))?;
+                Ok(Answer { text, address: None })
             }
             _ => Ok(Answer { text: "it cannot be asked over SPI: try it out".into(), address: None }),
         };
@@ -107,7 +117,7 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
     let mut wrong = None;
     for address in &way.addresses {
         let mut device = buses.i2c(*address)?;
-        match asked(catalog, check, &mut *device) {
+        match asked(catalog, check, buses, &mut *device) {
             Ok(text) => {
                 return Ok(Answer { text: format!("{text} at address {address:#04x}"), address: Some(*address) });
             }
@@ -136,10 +146,15 @@ enum Failure {
     Wrong(String),
 }
 
-fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result<String, Failure> {
+fn asked(
+    catalog: &Catalog,
+    check: &Check,
+    buses: &mut dyn Buses,
+    device: &mut dyn BusDevice,
+) -> Result<String, Failure> {
     let mut read = |write: &[u8], count: usize| {
         let mut bytes = vec![0; count];
-        device.read_register(write, &mut bytes).map(|()| bytes).map_err(|error: BusError| match error.status {
+        device.write_read(write, &mut bytes).map(|()| bytes).map_err(|error: BusError| match error.status {
             BusStatus::StartNack | BusStatus::Nack => Failure::Nobody,
             _ => Failure::Bus(error.trouble.to_string()),
         })
@@ -150,16 +165,19 @@ fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result
                 (0..READS).map(|_| read(&[*register], 1).map(|bytes| bytes[0])).collect::<Result<_, _>>()?;
             judge(catalog, Kind::I2c, *register, ids, &answers).map_err(Failure::Wrong)
         }
-        Check::Answer { write, bytes, crc } => {
-            let answer = read(write, *bytes)?;
-            // A register may hold zeros, but not ones only.
-            if let Some(why) = silence(Kind::I2c, &answer).filter(|_| answer.first() != Some(&0)) {
-                return Err(Failure::Wrong(why));
+        Check::Reads { reads } => {
+            for own in reads {
+                let answer = match own.wait_ms {
+                    0 => read(&own.write, own.mask.len())?,
+                    wait_ms => {
+                        read(&own.write, 0)?;
+                        buses.wait(Duration::from_millis(wait_ms));
+                        read(&[], own.mask.len())?
+                    }
+                };
+                known(own, &answer).map_err(Failure::Wrong)?;
             }
-            if *crc && answer.len() == 3 && crc8(&answer[..2]) != answer[2] {
-                return Err(Failure::Wrong(format!("{} has a wrong CRC: shorten the wires", hex(&answer))));
-            }
-            Ok("it answers".into())
+            Ok("it answers as its data sheet says".into())
         }
         Check::Temperature { write, bytes } => {
             let answer = read(write, *bytes)?;
@@ -179,15 +197,10 @@ fn asked(catalog: &Catalog, check: &Check, device: &mut dyn BusDevice) -> Result
     }
 }
 
-fn exchange(device: &mut dyn BusDevice, register: Option<u8>, count: usize) -> Result<Vec<u8>, String> {
-    // The MAX31856 and MAX31865 count their registers from 0 and have the bit for writing: reading is 0 there.
-    let head: Vec<u8> = match register {
-        Some(register) if count == 1 => vec![register | SPI_READ],
-        Some(register) => vec![register],
-        None => Vec::new(),
-    };
-    let mut bytes = vec![0; head.len() + count];
-    bytes[..head.len()].copy_from_slice(&head);
+/// Sends bytes to an SPI chip, and returns the bytes that follow.
+fn exchange(device: &mut dyn BusDevice, head: &[u8], count: usize) -> Result<Vec<u8>, String> {
+    let mut bytes = head.to_vec();
+    bytes.resize(head.len() + count, 0);
     device.exchange(&mut bytes).map_err(|error| error.trouble.to_string())?;
     Ok(bytes.split_off(head.len()))
 }
@@ -225,13 +238,51 @@ fn fixed(answer: &[u8], mask: &[u8], bits: &[u8], faults: &[Fault]) -> Result<St
         return Err(why);
     }
     let text = format!("it answers {}", hex(answer));
-    if answer.iter().zip(mask).zip(bits).any(|((answer, mask), bits)| answer & mask != *bits) {
+    if !has_bits(answer, mask, bits) {
         return Err(format!("{text}, as this chip never does: it is another chip, or data wires are swapped"));
     }
+    without(faults, answer).map(|()| text)
+}
+
+/// Has a chip look for faults, and leaves it as it was.
+fn detected(buses: &mut dyn Buses, device: &mut dyn BusDevice, detect: &Detect) -> Result<(), String> {
+    let old = exchange(device, &[detect.register], 1)?[0];
+    let write = detect.register | HIGH_BIT;
+    exchange(device, &[write, old | detect.set], 0)?;
+    buses.wait(Duration::from_millis(detect.wait_ms));
+    let status = exchange(device, &[detect.status], 1);
+    exchange(device, &[write, old], 0)?;
+    without(&detect.faults, &status?)
+}
+
+/// Fails with the first fault that the answer reports.
+fn without(faults: &[Fault], answer: &[u8]) -> Result<(), String> {
     match faults.iter().find(|fault| answer.get(fault.byte).is_some_and(|byte| byte & fault.bit != 0)) {
-        Some(fault) => Err(format!("{text}: {}", fault.meaning)),
-        None => Ok(text),
+        Some(fault) => Err(format!("it answers {}: {}", hex(answer), fault.meaning)),
+        None => Ok(()),
     }
+}
+
+/// The meaning of an I2C chip's answer to a read.
+fn known(read: &Read, answer: &[u8]) -> Result<(), String> {
+    let has_bits = has_bits(answer, &read.mask, &read.bits);
+    // The CRC of zeros may be zero.
+    if let Some(why) = silence(Kind::I2c, answer).filter(|_| !has_bits || read.crc.is_some()) {
+        return Err(why);
+    }
+    if !has_bits {
+        return Err(format!("it answers {}, as this chip never does: it is another chip", hex(answer)));
+    }
+    match (read.crc, answer.split_last()) {
+        (Some(start), Some((crc, bytes))) if crc8(start, bytes) != *crc => {
+            Err(format!("{} has a wrong CRC: shorten the wires", hex(answer)))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn has_bits(answer: &[u8], mask: &[u8], bits: &[u8]) -> bool {
+    answer.iter().zip(mask).zip(bits).all(|((answer, mask), bits)| answer & mask == *bits)
 }
 
 /// The meaning of all zeros or all ones.
@@ -251,9 +302,9 @@ fn silence(bus: Kind, answer: &[u8]) -> Option<String> {
     Some(format!("it answers {why}"))
 }
 
-/// The CRC of Sensirion's chips: polynomial 0x31, begun with 0xff (data sheet of the SHT3x).
-fn crc8(bytes: &[u8]) -> u8 {
-    bytes.iter().fold(0xff, |crc, byte| {
+/// The CRC of Sensirion's and TE's chips: polynomial 0x31 (data sheets of the SHT3x and HTU21D).
+fn crc8(start: u8, bytes: &[u8]) -> u8 {
+    bytes.iter().fold(start, |crc, byte| {
         (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { crc << 1 ^ 0x31 } else { crc << 1 })
     })
 }
@@ -278,6 +329,8 @@ mod tests {
     struct Chips(BTreeMap<u8, Vec<u8>>);
 
     struct Chip {
+        /// Whether an SPI transfer begins with a register.
+        has_registers: bool,
         answers: Vec<u8>,
         next: usize,
         is_there: bool,
@@ -294,9 +347,7 @@ mod tests {
 
     impl BusDevice for Chip {
         fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-            // A register's number is not 0 here.
-            let head = usize::from(bytes[0] != 0);
-            self.fill(&mut bytes[head..]);
+            self.fill(&mut bytes[usize::from(self.has_registers)..]);
             Ok(())
         }
 
@@ -310,14 +361,18 @@ mod tests {
     }
 
     impl Buses for Chips {
-        fn spi(&mut self, _way: &Way) -> Result<Box<dyn BusDevice>, String> {
-            Ok(Box::new(Chip { answers: self.0[&0].clone(), next: 0, is_there: true }))
+        fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+            let has_registers = !matches!(way.check, Some(Check::Fixed { register: None, .. }));
+            Ok(Box::new(Chip { has_registers, answers: self.0[&0].clone(), next: 0, is_there: true }))
         }
 
         fn i2c(&mut self, address: u8) -> Result<Box<dyn BusDevice>, String> {
             let answers = self.0.get(&address).cloned();
-            Ok(Box::new(Chip { is_there: answers.is_some(), answers: answers.unwrap_or_default(), next: 0 }))
+            let is_there = answers.is_some();
+            Ok(Box::new(Chip { has_registers: true, is_there, answers: answers.unwrap_or_default(), next: 0 }))
         }
+
+        fn wait(&mut self, _time: Duration) {}
     }
 
     fn asked(device: &str, way: usize, chips: &[(u8, &[u8])]) -> Result<Answer, String> {
@@ -363,11 +418,13 @@ mod tests {
             ("max6675", &[0x0c, 0x80], Ok("it answers 0c 80")),
             ("max6675", &[0x0c, 0x84], Err("no thermocouple is connected")),
             ("max6675", &[0x8c, 0x80], Err("as this chip never does")),
-            ("max31856", &[0x7f, 0xc0, 0x7f, 0xff, 0x80, 0x00], Ok("it answers 7f c0")),
+            // The thresholds, the old settings, the new ones, the faults, the old settings.
+            ("max31856", &[0x7f, 0xc0, 0x7f, 0xff, 0x80, 0x00, 0, 0, 0, 0], Ok("it answers 7f c0")),
+            ("max31856", &[0x7f, 0xc0, 0x7f, 0xff, 0x80, 0x00, 0, 0, 1, 0], Err("no thermocouple is connected")),
             ("max31856", &[0xff; 6], Err("all ones")),
             // Shifted by a bit.
             ("max31856", &[0x3f, 0xe0, 0x3f, 0xff, 0xc0, 0x00], Err("as this chip never does")),
-            ("max31865", &[0xff, 0xff, 0x00, 0x00], Ok("it answers ff ff 00 00")),
+            ("max31865", &[0xff, 0xff, 0x00, 0x00, 0, 0, 0, 0], Ok("it answers ff ff 00 00")),
             ("max31865", &[0x7f, 0xff, 0x80, 0x00], Err("as this chip never does")),
         ] {
             let result = asked(device, 0, &[(0, answer)]);
@@ -390,7 +447,8 @@ mod tests {
         assert!(error.starts_with("nobody answers at 0x76 or 0x77: check power"), "{error}");
         let error = asked("mpu9250", 0, &[(0x69, &[0x19])]).unwrap_err();
         assert!(error.starts_with("at address 0x69: its id is 0x19 instead of 0x74"), "{error}");
-        assert_eq!(asked("ssd1306", 0, &[(0x3d, &[0])]).unwrap().address, Some(0x3d));
+        // It is on, off and on.
+        assert_eq!(asked("ssd1306", 0, &[(0x3d, &[0x03, 0x43, 0x03])]).unwrap().address, Some(0x3d));
     }
 
     #[test]
@@ -402,7 +460,7 @@ mod tests {
         assert_eq!(asked("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().text, "it measures -10.0 degrees at address 0x4f");
         assert!(asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is no temperature"));
         // The example of the SHT3x's data sheet.
-        assert_eq!(crc8(&[0xbe, 0xef]), 0x92);
+        assert_eq!(crc8(0xff, &[0xbe, 0xef]), 0x92);
         assert!(asked("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
         assert!(asked("sht", 0, &[(0x45, &[0xbe, 0xef, 0x93])]).unwrap_err().contains("wrong CRC"));
     }
@@ -433,8 +491,10 @@ mod tests {
                         let others = others.flatten().filter(|id| !ids.contains(id));
                         answers.extend(others.map(|id| ("another chip", vec![*id])));
                     }
-                    Check::Fixed { .. } | Check::Temperature { .. } => answers.push(("zeros", vec![0; 8])),
-                    Check::Answer { .. } => answers.retain(|(what, _)| *what == "ones"),
+                    _ if way.driver.is_some() => continue,
+                    Check::Fixed { .. } | Check::Reads { .. } | Check::Temperature { .. } => {
+                        answers.push(("zeros", vec![0; 8]));
+                    }
                     Check::W1 | Check::Iio { .. } => continue,
                 }
                 for (what, answer) in answers {
@@ -456,6 +516,30 @@ mod tests {
     /// The chips of a simulated printer.
     struct Simulated(SimBoard);
 
+    impl Simulated {
+        /// The thermometers are on I2C, and nothing has the SPI bus of the header but what `change` puts there.
+        fn with(change: impl Fn(String) -> String) -> Simulated {
+            let described = concat!(env!("CARGO_MANIFEST_DIR"), "/crates/sim/src/default.toml");
+            let described = std::fs::read_to_string(described).unwrap();
+            let described = change(described.replace("bus = \"spidev0.0\"", "bus = \"spidev9.0\""));
+            let sensors = [("aht10", 0x38), ("htu21d", 0x40), ("sht3x", 0x44), ("lm75", 0x48), ("bme280", 0x77)];
+            let sensors = sensors.map(|(chip, address)| {
+                format!(
+                    "[[part]]\nkind = \"i2c_sensor\"\nname = \"{chip}\"\nchip = \"{chip}\"\nbus = \"i2c.1\"\n\
+                     address = {address}\nheater = \"heater_bed\"\n"
+                )
+            });
+            let bus = "\n[[spi_bus]]\nname = \"spidev9.0\"\n";
+            let config = SimConfig::parse(&[&*described, bus, &sensors.concat()].concat(), "this test").unwrap();
+            Simulated(SimBoard::new(config, Arc::new(Monotonic::start())).unwrap())
+        }
+
+        fn ask(&mut self, device: &str) -> Result<Answer, String> {
+            let catalog = Catalog::read().unwrap();
+            ask(&catalog, &catalog.device(device).unwrap().way[0], self)
+        }
+    }
+
     impl Buses for Simulated {
         fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
             let bus = self.0.spi_buses().iter().find(|bus| bus.name == "spidev0.0").unwrap().first;
@@ -472,21 +556,45 @@ mod tests {
 
     #[test]
     fn the_simulated_printer_s_chips_are_known() {
-        let described = concat!(env!("CARGO_MANIFEST_DIR"), "/crates/sim/src/default.toml");
-        let described = std::fs::read_to_string(described).unwrap();
-        // The accelerometer has the bus of the header for itself.
-        let described = described.replace("bus = \"spidev0.0\"", "bus = \"spidev9.0\"").replace(
-            "kind = \"adxl345\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
-            "kind = \"adxl345\"\nbus = \"spidev0.0\"",
-        ) + "\n[[spi_bus]]\nname = \"spidev9.0\"\n";
-        let config = SimConfig::parse(&described, "this test").unwrap();
-        let mut chips = Simulated(SimBoard::new(config, Arc::new(Monotonic::start())).unwrap());
-        let catalog = Catalog::read().unwrap();
-        let mut asked = |device: &str| ask(&catalog, &catalog.device(device).unwrap().way[0], &mut chips);
-        assert_eq!(asked("adxl345").unwrap().text, "its id is 0xe5");
-        assert!(asked("lis2dw").is_err());
-        assert_eq!(asked("ssd1306").unwrap().address, Some(0x3c));
-        assert!(asked("bme280").unwrap_err().starts_with("nobody answers at 0x76 or 0x77"));
+        let mut chips = Simulated::with(|described| {
+            described.replace(
+                "kind = \"adxl345\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
+                "kind = \"adxl345\"\nbus = \"spidev0.0\"",
+            )
+        });
+        assert_eq!(chips.ask("adxl345").unwrap().text, "its id is 0xe5");
+        assert!(chips.ask("lis2dw").is_err());
+        for (device, address) in
+            [("ssd1306", 0x3c), ("aht", 0x38), ("htu21d", 0x40), ("sht", 0x44), ("lm75", 0x48), ("bme280", 0x77)]
+        {
+            assert_eq!(chips.ask(device).unwrap().address, Some(address), "{device}");
+        }
+        // It is an LM75.
+        let error = chips.ask("ads1115").unwrap_err();
+        assert!(error.starts_with("at address 0x48: it answers 4b 00, as this chip never does"), "{error}");
+        assert!(chips.ask("mpu9250").unwrap_err().starts_with("nobody answers at 0x68 or 0x69"));
+    }
+
+    #[test]
+    fn a_simulated_thermocouple_that_is_open_is_reported() {
+        for device in ["max6675", "max31855", "max31856", "max31865"] {
+            let with = |fault: &str| {
+                let part = format!(
+                    "[[part]]\nkind = \"thermocouple\"\nname = \"this\"\nchip = \"{device}\"\nbus = \"spidev0.0\"\n\
+                     heater = \"heater_bed\"\n{fault}"
+                );
+                Simulated::with(|described| format!("{described}\n{part}"))
+            };
+            let mut chip = with("");
+            // The first conversion of a MAX31855 and a MAX6675.
+            thread::sleep(Duration::from_millis(250));
+            chip.ask(device).unwrap();
+            chip.ask(device).unwrap();
+            let mut chip = with("fault = \"open\"\n");
+            thread::sleep(Duration::from_millis(250));
+            let error = chip.ask(device).unwrap_err();
+            assert!(error.ends_with(" is connected"), "{device}: {error}");
+        }
     }
 
     proptest! {

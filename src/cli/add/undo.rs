@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde_json::json;
@@ -14,7 +14,7 @@ use super::catalog::{Catalog, Device};
 use super::moonraker::Moonraker;
 use super::printer::Printer;
 use super::report::Report;
-use super::{AddArgs, BUS, MOONRAKER, ask, host, refuse_while_printing, system};
+use super::{AddArgs, BUS, MOONRAKER, ask, bus, host, refuse_while_printing, system};
 
 /// Takes all changes of a device back.
 pub(super) fn undo(
@@ -24,12 +24,26 @@ pub(super) fn undo(
     device: &Device,
     report: &mut Report,
 ) -> Result<(), String> {
-    let names: Vec<&str> = catalog.devices.iter().map(|device| device.name).collect();
     let mut sides = vec![system(computer)];
+    let mut in_use = BTreeMap::new();
     match Printer::find(computer, args.config.as_deref()) {
-        Ok(printer) => sides.push(host(computer, &printer)),
+        Ok(printer) => {
+            sides.push(host(computer, &printer));
+            if let Some(board) = catalog.board(computer) {
+                in_use = bus::in_use(board, &printer, device);
+            }
+        }
         Err(why) if args.config.is_some() => return Err(why),
         Err(why) => report.line(why),
+    }
+    // The needs of a device are on both sides, and a bus that it needs is on root's.
+    let mut heirs = Vec::new();
+    for other in catalog.devices.iter().filter(|other| other.name != device.name) {
+        let mut needs = BTreeSet::new();
+        for side in &sides {
+            needs.extend(side.record(other.name)?.unwrap_or_default().needs);
+        }
+        heirs.push((other.name, needs));
     }
     let mut records = Vec::new();
     for side in sides {
@@ -49,11 +63,13 @@ pub(super) fn undo(
     report.set("changes", json!(files));
     ask(args, computer, report, "Put them back?")?;
     let mut reboots = false;
+    let mut left = Vec::new();
     for (side, record) in &records {
         reboots |= record.changes.iter().any(|change| change.key.starts_with(BUS));
-        let left = side.undo(device.name, &names)?;
-        left.iter().for_each(|line| report.line(line));
+        left.extend(side.undo(device.name, &heirs, &in_use)?);
     }
+    left.iter().for_each(|line| report.line(line));
+    report.set("left", json!(left));
     report.set("reboot", json!(reboots));
     if reboots {
         report.line("The bus is off after a reboot, unless another device needs it.");
