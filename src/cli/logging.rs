@@ -232,14 +232,9 @@ fn is_same(named: &str, descriptor: BorrowedFd<'_>) -> bool {
     file.is_ok_and(|file| named == format!("{}:{}", file.dev(), file.ino()))
 }
 
-/// Whether a line is of Pinion. Lines of libraries are left out: they name neither a subject nor a remedy.
-fn is_own(metadata: &Metadata<'_>) -> bool {
-    metadata.target().starts_with("pinion")
-}
-
 impl Log for Stderr {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        metadata.level() <= log::max_level() && is_own(metadata)
+        metadata.level() <= log::max_level()
     }
 
     fn log(&self, record: &Record<'_>) {
@@ -324,13 +319,6 @@ mod tests {
         assert_eq!(kept, (0..LINES_MAX).map(|n| n.to_string()).collect::<Vec<_>>());
         assert!(told.ends_with("WARN  3 lines of the log were lost, as nobody read it\n"), "{told}");
         assert!(queue.is_done());
-    }
-
-    #[test]
-    fn lines_of_libraries_are_left_out() {
-        let from = |target| Metadata::builder().level(log::Level::Warn).target(target).build();
-        assert!(is_own(&from("pinion::cli::run")) && is_own(&from("pinion_runtime::link")));
-        assert!(!is_own(&from("tiny_skia::painter")));
     }
 
     #[test]

@@ -83,6 +83,13 @@ fn outline(points: impl IntoIterator<Item = [f64; 2]>, close: bool) -> Option<ti
     path.finish()
 }
 
+/// Whether there is something to fill. tiny-skia logs a warning for an outline that is narrower than this.
+fn has_area(path: &tiny_skia::Path) -> bool {
+    const LEAST: f32 = 1.0 / 4096.0;
+    let bounds = path.bounds();
+    bounds.width() > LEAST && bounds.height() > LEAST
+}
+
 impl Canvas {
     /// `None` without a pixel.
     pub fn new(width: u32, height: u32) -> Option<Canvas> {
@@ -91,7 +98,7 @@ impl Canvas {
 
     /// A convex or other outline, filled.
     pub fn polygon(&mut self, points: impl IntoIterator<Item = [f64; 2]>, rgb: Rgb, alpha: f64) {
-        if let Some(path) = outline(points, true) {
+        if let Some(path) = outline(points, true).filter(has_area) {
             self.pixmap.fill_path(
                 &path,
                 &paint(rgb, alpha * self.opacity),
@@ -112,7 +119,7 @@ impl Canvas {
 
     /// A filled circle.
     pub fn circle(&mut self, [x, y]: [f64; 2], radius: f64, rgb: Rgb, alpha: f64) {
-        if let Some(path) = PathBuilder::from_circle(x as f32, y as f32, radius as f32) {
+        if let Some(path) = PathBuilder::from_circle(x as f32, y as f32, radius as f32).filter(has_area) {
             self.pixmap.fill_path(
                 &path,
                 &paint(rgb, alpha * self.opacity),
