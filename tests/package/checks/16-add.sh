@@ -1,10 +1,11 @@
 # pinion add of the package: on this computer, which is no known board, and on the files of a Raspberry Pi's card with a
 # stand-in for Moonraker and klippy.
 pinion add | grep 'is not among the known boards'
-not pinion add adxl345 --yes 2>/run/refused
-grep 'look up in its manual which pins have SPI' /run/refused
+mkdir /run/add
+not pinion add adxl345 --yes 2>/run/add/refused
+grep 'look up in its manual which pins have SPI' /run/add/refused
 
-card=/run/card config=/run/card/home/klippy/printer_data/config
+card=/run/add/card config=/run/add/card/home/klippy/printer_data/config
 mkdir -p $card/proc/device-tree $card/boot/firmware $config
 printf 'Raspberry Pi 4 Model B Rev 1.4\0' >$card/proc/device-tree/model
 # Its last line has no end.
@@ -17,12 +18,12 @@ files() {
     find $card -path $card/var -prune -o -printf '%p %M %u %g\n'
     find $card -path $card/var -prune -o -type f -exec sha256sum {} +
 }
-files | sort >/run/before
+files | sort >/run/add/before
 same() { files | sort | diff "$1" -; }
 on_card() { pinion add --root $card "$@"; }
 
 # A host that reads printer.cfg when it restarts, and has an accelerometer if its section is there.
-cat >/run/moonraker <<'END_OF_PROGRAM'
+cat >/run/add/moonraker <<'END_OF_PROGRAM'
 import glob, http.server, json, os, sys
 CONFIG = sys.argv[1]
 host = {"state": "standby", "sections": [], "answers": []}
@@ -63,31 +64,32 @@ class Moonraker(http.server.BaseHTTPRequestHandler):
 
 http.server.HTTPServer(("127.0.0.1", 7126), Moonraker).serve_forever()
 END_OF_PROGRAM
-python3 /run/moonraker $config/printer.cfg 2>/run/requests &
+python3 /run/add/moonraker $config/printer.cfg 2>/run/add/requests &
 trap "kill $!" EXIT
 says() { python3 -c 'import sys, urllib.request; print(urllib.request.urlopen("http://127.0.0.1:7126" + sys.argv[1]).read().decode())' "$1"; }
 until_true 30 says /
 
 on_card | grep '^This is a Raspberry Pi 4'
-on_card adxl345 --dry-run | tee /run/shown
-grep -x '+ dtparam=spi=on' /run/shown
-same /run/before
+on_card adxl345 --dry-run | tee /run/add/shown
+grep -x '+ dtparam=spi=on' /run/add/shown
+same /run/add/before
 # Nothing changes during a print.
 says /stand-in/printing
-not on_card adxl345 --yes --moonraker 127.0.0.1:7126 2>/run/refused
-grep 'the host prints' /run/refused
-same /run/before
+not on_card adxl345 --yes --moonraker 127.0.0.1:7126 2>/run/add/refused
+grep 'the host prints' /run/add/refused
+same /run/add/before
 says /stand-in/standby
-on_card adxl345 --yes --moonraker 127.0.0.1:7126 | tee /run/added
-grep 'it measures 120, -80, 9805 mm/s2: 1.00 of gravity' /run/added
+on_card adxl345 --yes --moonraker 127.0.0.1:7126 | tee /run/add/added
+grep 'it measures 120, -80, 9805 mm/s2: 1.00 of gravity' /run/add/added
 grep -x 'dtparam=spi=on' $card/boot/firmware/config.txt
 is "$(stat -c '%U %a' $config/printer.cfg)" "klippy 640" printer.cfg
 is "$(stat -c %U $config/pinion/adxl345.cfg)" klippy "the device's file"
-files | sort >/run/after
-grep -c firmware_restart /run/requests >/run/restarts
+files | sort >/run/add/after
+grep -c firmware_restart /run/add/requests >/run/add/restarts
 on_card adxl345 --yes --moonraker 127.0.0.1:7126 | grep 'Nothing is left to change'
-same /run/after
-is "$(grep -c firmware_restart /run/requests)" "$(cat /run/restarts)" "the number of restarts"
+same /run/add/after
+is "$(grep -c firmware_restart /run/add/requests)" "$(cat /run/add/restarts)" "the number of restarts"
 on_card adxl345 --undo --yes --moonraker 127.0.0.1:7126 | grep 'The host has restarted without it'
-same /run/before
+same /run/add/before
 says / | not grep adxl345
+rm -r /run/add
