@@ -280,6 +280,7 @@ mod tests {
         assert_eq!(told("#overlays=a\n").unwrap(), "#overlays=a\noverlays=spidev1_1\n");
         assert_eq!(told("rootdev=1").unwrap(), "rootdev=1\noverlays=spidev1_1\n");
         assert_eq!(told("overlays=\r\nx=y\r\n").unwrap(), "overlays=spidev1_1\r\nx=y\r\n");
+        assert_eq!(told("overlays= ").unwrap(), "overlays=spidev1_1 ");
         for on in ["overlays=x spidev1_1\n", "overlays=sun50i-h616-spidev1_1\n"] {
             assert_eq!(told(on).unwrap(), on);
         }

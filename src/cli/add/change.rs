@@ -96,7 +96,8 @@ fn remove_word(text: &mut String, key: &str, word: &str) -> bool {
     }
     let Some(at) = found else { return false };
     let end = at + word.len();
-    let is_before_another = text[end..].strip_prefix(' ').is_some_and(|rest| !rest.starts_with(char::is_whitespace));
+    let is_before_another =
+        text[end..].strip_prefix(' ').is_some_and(|rest| rest.starts_with(|c: char| !c.is_whitespace()));
     let (at, end) = match (text[..at].ends_with(' '), is_before_another) {
         (true, _) => (at - 1, end),
         (false, true) => (at, end + 1),
