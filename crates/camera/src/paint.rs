@@ -3,7 +3,7 @@
 
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{
-    BlendMode, Color, FillRule, FilterQuality, GradientStop, LineCap, LinearGradient, Paint, PathBuilder, Pixmap,
+    BlendMode, Color, FillRule, FilterQuality, GradientStop, LineCap, LinearGradient, Paint, Path, PathBuilder, Pixmap,
     PixmapPaint, Point as Pixel, PremultipliedColorU8, RadialGradient, Rect, Shader, SpreadMode, Stroke, Transform,
 };
 
@@ -71,7 +71,7 @@ fn pixel([x, y]: [f64; 2]) -> Pixel {
     Pixel::from_xy(x as f32, y as f32)
 }
 
-fn outline(points: impl IntoIterator<Item = [f64; 2]>, close: bool) -> Option<tiny_skia::Path> {
+fn outline(points: impl IntoIterator<Item = [f64; 2]>, close: bool) -> Option<Path> {
     let mut path = PathBuilder::new();
     for point in points {
         let Pixel { x, y } = pixel(point);
@@ -83,13 +83,6 @@ fn outline(points: impl IntoIterator<Item = [f64; 2]>, close: bool) -> Option<ti
     path.finish()
 }
 
-/// Whether there is something to fill. tiny-skia logs a warning for an outline that is narrower than this.
-fn has_area(path: &tiny_skia::Path) -> bool {
-    const LEAST: f32 = 1.0 / 4096.0;
-    let bounds = path.bounds();
-    bounds.width() > LEAST && bounds.height() > LEAST
-}
-
 impl Canvas {
     /// `None` without a pixel.
     pub fn new(width: u32, height: u32) -> Option<Canvas> {
@@ -98,15 +91,7 @@ impl Canvas {
 
     /// A convex or other outline, filled.
     pub fn polygon(&mut self, points: impl IntoIterator<Item = [f64; 2]>, rgb: Rgb, alpha: f64) {
-        if let Some(path) = outline(points, true).filter(has_area) {
-            self.pixmap.fill_path(
-                &path,
-                &paint(rgb, alpha * self.opacity),
-                FillRule::Winding,
-                Transform::identity(),
-                None,
-            );
-        }
+        self.fill(outline(points, true), rgb, alpha);
     }
 
     /// A line through these points.
@@ -119,14 +104,16 @@ impl Canvas {
 
     /// A filled circle.
     pub fn circle(&mut self, [x, y]: [f64; 2], radius: f64, rgb: Rgb, alpha: f64) {
-        if let Some(path) = PathBuilder::from_circle(x as f32, y as f32, radius as f32).filter(has_area) {
-            self.pixmap.fill_path(
-                &path,
-                &paint(rgb, alpha * self.opacity),
-                FillRule::Winding,
-                Transform::identity(),
-                None,
-            );
+        self.fill(PathBuilder::from_circle(x as f32, y as f32, radius as f32), rgb, alpha);
+    }
+
+    fn fill(&mut self, path: Option<Path>, rgb: Rgb, alpha: f64) {
+        // tiny-skia fills no outline that is narrower, and logs a warning for it.
+        const NARROWEST: f32 = 1.0 / 4096.0;
+        let has_area = |path: &Path| path.bounds().width() > NARROWEST && path.bounds().height() > NARROWEST;
+        if let Some(path) = path.filter(has_area) {
+            let paint = paint(rgb, alpha * self.opacity);
+            self.pixmap.fill_path(&path, &paint, FillRule::Winding, Transform::identity(), None);
         }
     }
 
