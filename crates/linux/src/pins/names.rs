@@ -383,6 +383,5 @@ mod tests {
             back.sort();
             prop_assert_eq!(named, back);
         }
-
     }
 }

@@ -285,21 +285,23 @@ impl Trial<'_> {
     /// time, the step says nothing about the printer. Any other failure of a late klippy is tried once more: a probe that
     /// answers late homes at another height.
     fn tried(&mut self, step: &Step) -> Outcome {
-        let mut tries = TRIES;
+        let mut repeated = 0;
         loop {
             self.host.stalls.take();
             let outcome = (step.run)(self);
             let stall = self.host.stalls.take();
             let Outcome::Failed { cause, .. } = &outcome else { return outcome };
-            let is_busy = BUSY.iter().any(|words| cause.contains(words));
-            if self.broken.is_some() || !is_busy && (stall < STALL || tries < TRIES) {
+            if self.broken.is_some() {
                 return outcome;
             }
-            if tries == 0 || !self.begins_again(step.name) {
-                let is_slow = is_busy && stall >= STALL;
+            let is_busy = BUSY.iter().any(|words| cause.contains(words));
+            let is_late = stall >= STALL;
+            let repeats = if is_busy { TRIES } else { u32::from(is_late) };
+            if repeated >= repeats || !self.begins_again(step.name) {
+                let is_slow = is_busy && is_late;
                 return if is_slow { Outcome::Slow { cause: cause.clone(), stall } } else { outcome };
             }
-            tries -= 1;
+            repeated += 1;
         }
     }
 

@@ -99,7 +99,10 @@ fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
         names.map(|name| named(&description, "axis", "name", name)["start_mm"].as_float().unwrap()).collect()
     };
     let more: String = (2..4)
-        .map(|n| format!("[stepper_z{n}]\nstep_pin: tool:gpio1{n}\ndir_pin: tool:gpio2{n}\nmicrosteps: 16\nrotation_distance: 8\n"))
+        .map(|n| {
+            let pins = format!("step_pin: tool:gpio1{n}\ndir_pin: tool:gpio2{n}");
+            format!("[stepper_z{n}]\n{pins}\nmicrosteps: 16\nrotation_distance: 8\n")
+        })
         .collect();
     // Not in klippy's order of the corners for [quad_gantry_level].
     let corners = "z_positions: 0,0\n  200,0\n  0,300\n  200,300\n";
