@@ -213,35 +213,29 @@ impl Core {
         false
     }
 
-    /// Waits until a timer is due, or for a call. Returns the time now.
+    /// Waits until a timer is due, or for a call. Before a far timer the core sleeps without spinning at the end, so that
+    /// the heartbeat continues. Returns the time now.
     #[inline]
     fn wait(&mut self, now: Clock, deadline: Option<Clock>) -> Clock {
+        let Core { waiter, progress, stops_taken, yielded, mcu, block, requests, .. } = self;
+        let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
         let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
         let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
             // Sleep half the way: this leaves room for a late wake-up.
-            return self.nap(now, now + Ticks(FAR_TICKS.min(to_go / 2) as u32));
+            let end = now + Ticks(FAR_TICKS.min(to_go / 2) as u32);
+            return if calls.any() { now } else { waiter.nap(now, end) };
         };
-        let exact = self.mcu.next_exact_timer();
-        let Core { waiter, progress, stops_taken, mcu, block, requests, .. } = self;
-        let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
+        let exact = calls.mcu.next_exact_timer();
         // Near a timer, calls have to wait.
         match waiter.wait(now, deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
             // The edge must not wait for another read of the clock.
             Woken::Due(now) => {
-                self.mcu.saw(now);
-                self.yielded += 1;
+                mcu.saw(now);
+                *yielded += 1;
                 now
             }
             Woken::Called(now) => now,
         }
-    }
-
-    /// Sleeps while no timer is due, or until the core is woken, so that the heartbeat continues. Unlike the wait for a
-    /// timer, it ends without spinning. Returns the time now.
-    fn nap(&mut self, now: Clock, end: Clock) -> Clock {
-        let Core { progress, stops_taken, mcu, block, requests, .. } = &*self;
-        let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
-        if calls.any() { now } else { self.waiter.nap(now, end) }
     }
 
     /// Records the last sleep, and the MCU's changes. The core does this when no timer is due, before it polls or
