@@ -143,10 +143,7 @@ impl Program {
 
     /// All of its threads.
     pub fn threads(&self) -> Vec<Pid> {
-        let threads = |process: Pid| fs::read_dir(format!("/proc/{process}/task")).expect("a running program");
-        let id = |thread: DirEntry| thread.file_name().to_str().and_then(|id| id.parse().ok()).expect("a thread's id");
-        let all = self.processes().flat_map(threads);
-        all.map(|thread| Pid::from_raw(id(thread.expect("a readable folder")))).collect()
+        self.processes().flat_map(threads).collect()
     }
 
     /// The processor time of all its threads so far.
@@ -231,6 +228,13 @@ impl Drop for Program {
 /// The command of the program that is measured instead of Pinion: see `init.sh`.
 pub fn other() -> Option<String> {
     env::var("MEASURED_PROGRAM").ok().filter(|command| !command.is_empty())
+}
+
+/// The threads of a running process.
+pub fn threads(process: Pid) -> impl Iterator<Item = Pid> {
+    let id = |thread: DirEntry| thread.file_name().to_str().and_then(|id| id.parse().ok()).expect("a thread's id");
+    let all = fs::read_dir(format!("/proc/{process}/task")).expect("a running program");
+    all.map(move |thread| Pid::from_raw(id(thread.expect("a readable folder"))))
 }
 
 /// Whether the process exists and has not ended.

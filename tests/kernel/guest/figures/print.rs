@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 
 use super::{Others, figure, is_pinion};
 use crate::gpio_sim::GpioSim;
-use crate::program::Program;
+use crate::program::{self, Program};
 use crate::sysfs;
 use crate::trace::Trace;
 
@@ -107,25 +107,26 @@ impl Print {
     }
 
     fn signal(&self, signal: Signal) {
-        kill(Pid::from_raw(self.klippy.id().try_into().expect("a process id")), signal).expect("klippy runs");
+        kill(self.klippy_pid(), signal).expect("klippy runs");
+    }
+
+    fn klippy_pid(&self) -> Pid {
+        Pid::from_raw(self.klippy.id().try_into().expect("a process id"))
     }
 
     /// The processor time of klippy and of the MCU's threads so far, by name.
     fn cpu_time(&self) -> BTreeMap<String, Duration> {
         let mut times = BTreeMap::new();
-        let mut add = |whose: &str, thread: &str| {
+        let mut add = |whose: &str, thread: Pid| {
             // Time on the processor in ns, time in its queue, number of turns.
             let ns = sysfs::read(format!("/proc/{thread}/schedstat"));
             let ns = ns.split(' ').next().and_then(|ns| ns.parse().ok()).expect("a time");
             *times.entry(whose.to_owned()).or_default() += Duration::from_nanos(ns);
         };
-        for thread in fs::read_dir(format!("/proc/{}/task", self.klippy.id())).expect("klippy runs") {
-            add("klippy", &thread.expect("a thread").file_name().to_string_lossy());
-        }
+        program::threads(self.klippy_pid()).for_each(|thread| add("klippy", thread));
         for thread in self.program.threads() {
-            let thread = thread.to_string();
-            add("the MCU", &thread);
-            add(&format!("the MCU: {}", sysfs::read(format!("/proc/{thread}/comm"))), &thread);
+            add("the MCU", thread);
+            add(&format!("the MCU: {}", sysfs::read(format!("/proc/{thread}/comm"))), thread);
         }
         times
     }
