@@ -70,6 +70,13 @@ pub fn each_page(checks: Vec<Check>) -> Result<Vec<Check>, String> {
     }
 }
 
+/// Whether the check tries pages of which nothing can be tried. It would only install the package.
+pub fn has_nothing_to_try(check: &Check) -> bool {
+    let can_be_tried =
+        |page: &Page| page.blocks().iter().any(|block| block.kind == COMMANDS && block.not_tried.is_none());
+    !pages().iter().any(|page| tried(check).any(|name| name == page.name) && can_be_tried(page))
+}
+
 /// A line for each untried block in the pages of this check.
 pub fn not_tried(check: &Check) -> Vec<String> {
     let mut lines = Vec::new();

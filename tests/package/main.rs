@@ -129,6 +129,13 @@ fn run(options: &Options) -> Result<bool, String> {
     // VM helps when its own checks are done.
     let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(commands::tries_any);
     of_pages.retain(|check| options.chosen(check));
+    of_pages.retain(|check| {
+        let has_nothing = commands::has_nothing_to_try(check);
+        if has_nothing {
+            commands::not_tried(check).iter().for_each(|line| println!("{line}"));
+        }
+        !has_nothing
+    });
     if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
         others.retain(|check| check.name == INSTALLS || options.chosen(check));
     } else {
