@@ -315,6 +315,21 @@ fn a_chip_with_two_buses_takes_the_free_one() {
     assert_eq!(card.snapshot(), before);
 }
 
+/// The same where a section without a bus has a pin of it.
+#[test]
+fn a_chip_with_two_buses_avoids_a_pin_that_is_in_use() {
+    let card = Card::pi();
+    card.put(
+        PRINTER,
+        &(card.read(PRINTER) + "\n[mcu host]\nserial: /tmp/klipper_host_mcu\n[output_pin x]\npin: host:gpio10\n"),
+    );
+    let told = card.added(&["lis2dw", "--yes"]);
+    let conflict =
+        "printer.cfg uses GPIO10 (pin 19) for something else, and the bus needs it: so it is connected by I2C.";
+    assert!(told.contains(conflict), "{told}");
+    assert!(card.refused(&["adxl345", "--yes"]).contains("printer.cfg uses GPIO10 (pin 19)"));
+}
+
 #[test]
 fn programs_get_the_same_as_json() {
     let card = Card::pi();

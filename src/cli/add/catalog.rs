@@ -327,6 +327,15 @@ pub(super) fn model(computer: &Computer) -> String {
     computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
 }
 
+/// Whether a line of the header is among these. Each of its names counts: GPIO17, gpio17, gpiochip0/gpio17,
+/// pinctrl-bcm2711/gpio17.
+fn is_among(taken: &BTreeSet<String>, line: &str) -> bool {
+    let name_of = |line: &str| line.rsplit('/').next().unwrap_or(line).to_ascii_lowercase();
+    let is_of_header =
+        |other: &str| !other.contains('/') || other.starts_with("gpiochip") || other.starts_with("pinctrl-");
+    taken.iter().any(|other| other == line || is_of_header(other) && name_of(other) == name_of(line))
+}
+
 impl KnownBoard {
     /// Whether a device can be connected in this way.
     pub(super) fn has(&self, way: &Way) -> bool {
@@ -346,12 +355,17 @@ impl KnownBoard {
     }
 
     /// A place on the header for a device that is connected in this way. `uses` says whether printer.cfg uses a node for
-    /// another device.
+    /// another device. `taken` are lines that are in use.
     ///
     /// # Errors
     ///
     /// One line: another device is there.
-    pub(super) fn spot(&self, way: &Way, uses: &dyn Fn(Kind, &str) -> Option<String>) -> Result<Spot, String> {
+    pub(super) fn spot(
+        &self,
+        way: &Way,
+        uses: &dyn Fn(Kind, &str) -> Option<String>,
+        taken: &BTreeSet<String>,
+    ) -> Result<Spot, String> {
         if !self.bus.contains_key(&way.bus) {
             return Ok(Spot::default());
         }
@@ -371,12 +385,23 @@ impl KnownBoard {
                 let conflicts = other.node == spot.node || if is_same { wants_all } else { crosses };
                 conflicts.then(|| format!("[{section}] in printer.cfg uses {}, whose pins it would need", other.node))
             });
+            // The wire of 1-Wire goes where config.txt has it.
+            let conflict = conflict.or_else(|| self.taken_by_another(&spot, taken).filter(|_| way.bus != Kind::W1));
             match conflict {
                 None => return Ok(spot),
                 Some(conflict) => refusal = conflict,
             }
         }
         Err(refusal)
+    }
+
+    /// The pin of this place that printer.cfg uses for something else.
+    fn taken_by_another(&self, spot: &Spot, taken: &BTreeSet<String>) -> Option<String> {
+        // On a Raspberry Pi the label of a bus's pin begins with the line's name.
+        let label = |pin: usize| self.pins.get(pin - 1).and_then(|label| label.split(' ').next()).unwrap_or_default();
+        let is_taken = |pin: &&usize| label(**pin).starts_with("GPIO") && is_among(taken, label(**pin));
+        let pin = *spot.pins.values().find(is_taken)?;
+        Some(format!("printer.cfg uses {} (pin {pin}) for something else, and the bus needs it", label(pin)))
     }
 
     /// The wires to make. `taken` are lines that are in use. `wanted` is the pin that the user has chosen for the first
@@ -392,19 +417,11 @@ impl KnownBoard {
         taken: &BTreeSet<String>,
         wanted: Option<usize>,
     ) -> Result<Vec<Wire>, String> {
-        let own: BTreeSet<usize> = spot.pins.values().copied().collect();
-        // Each of a line's names counts: GPIO17, gpio17, gpiochip0/gpio17, pinctrl-bcm2711/gpio17.
-        let is_taken = |line: &str| {
-            let name_of = |line: &str| line.rsplit('/').next().unwrap_or(line).to_ascii_lowercase();
-            let is_of_header =
-                |other: &str| !other.contains('/') || other.starts_with("gpiochip") || other.starts_with("pinctrl-");
-            taken.iter().any(|other| other == line || is_of_header(other) && name_of(other) == name_of(line))
-        };
-        // On a Raspberry Pi the label of a bus's pin begins with the line's name.
-        let label = |pin: usize| self.pins.get(pin - 1).and_then(|label| label.split(' ').next()).unwrap_or_default();
-        if let Some(pin) = own.iter().find(|pin| label(**pin).starts_with("GPIO") && is_taken(label(**pin))) {
-            return Err(format!("printer.cfg uses {} (pin {pin}) for something else: the bus needs it", label(*pin)));
+        if let Some(conflict) = self.taken_by_another(spot, taken) {
+            return Err(conflict);
         }
+        let own: BTreeSet<usize> = spot.pins.values().copied().collect();
+        let is_taken = |line: &str| is_among(taken, line);
         let is_free = |pin: &usize| !own.contains(pin) && self.line(*pin).is_some_and(|line| !is_taken(line));
         let mut free = self.free.iter().copied().filter(is_free).filter(|pin| Some(*pin) != wanted);
         let mut wires = Vec::new();
@@ -499,7 +516,12 @@ mod tests {
                 }
                 // Every device can be added to a Raspberry Pi 4.
                 let wires = catalog.boards[1]
-                    .wires(way, &catalog.boards[1].spot(way, &|_, _| None).unwrap(), &BTreeSet::new(), None)
+                    .wires(
+                        way,
+                        &catalog.boards[1].spot(way, &|_, _| None, &BTreeSet::new()).unwrap(),
+                        &BTreeSet::new(),
+                        None,
+                    )
                     .unwrap();
                 let mut signals: Vec<usize> = wires.iter().map(|wire| wire.pin).collect();
                 signals.sort_unstable();
@@ -571,7 +593,7 @@ mod tests {
         let spot = |device: &str, used: &[&str]| {
             let used: Vec<String> = used.iter().map(|node| (*node).to_owned()).collect();
             let uses = move |_: Kind, node: &str| used.contains(&node.to_owned()).then(|| "x".to_owned());
-            board.spot(&catalog.device(device).unwrap().way[0], &uses).map(|spot| spot.node)
+            board.spot(&catalog.device(device).unwrap().way[0], &uses, &BTreeSet::new()).map(|spot| spot.node)
         };
         assert_eq!(spot("adxl345", &[]).unwrap(), "spidev0.0");
         assert_eq!(spot("adxl345", &["spidev0.0"]).unwrap(), "spidev0.1");
@@ -579,7 +601,7 @@ mod tests {
             spot("adxl345", &["spidev0.0", "spidev0.1"]).unwrap_err().starts_with("[x] in printer.cfg uses spidev0.")
         );
         let uses_leds = |_: Kind, node: &str| (node == "spidev0.0").then(|| "neopixel a".to_owned());
-        assert!(board.spot(&catalog.device("adxl345").unwrap().way[0], &uses_leds).is_err());
+        assert!(board.spot(&catalog.device("adxl345").unwrap().way[0], &uses_leds, &BTreeSet::new()).is_err());
         for alone in ["ws2812", "hx711"] {
             assert!(spot(alone, &["spidev0.1"]).is_err(), "{alone}");
         }
@@ -593,11 +615,15 @@ mod tests {
     fn a_bus_does_not_take_a_pin_that_printer_cfg_uses() {
         let catalog = Catalog::read().unwrap();
         let (board, way) = (&catalog.boards[1], &catalog.device("adxl345").unwrap().way[0]);
-        let spot = board.spot(way, &|_, _| None).unwrap();
+        let spot = board.spot(way, &|_, _| None, &BTreeSet::new()).unwrap();
         let wires = |taken: &str| board.wires(way, &spot, &[taken.to_owned()].into(), None);
         assert!(wires("gpio17").is_ok());
         assert!(wires("gpio10").unwrap_err().starts_with("printer.cfg uses GPIO10 (pin 19)"));
         assert!(wires("GPIO8").unwrap_err().contains("the bus needs it"));
+        let node = |line: &str| board.spot(way, &|_, _| None, &[line.to_owned()].into()).map(|spot| spot.node);
+        assert_eq!(node("gpio17").unwrap(), "spidev0.0");
+        assert_eq!(node("gpio8").unwrap(), "spidev0.1", "the other chip select");
+        assert!(node("gpio10").unwrap_err().starts_with("printer.cfg uses GPIO10 (pin 19)"));
     }
 
     #[test]

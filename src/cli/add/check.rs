@@ -131,6 +131,8 @@ fn strays(computer: &Computer, board: &KnownBoard, spot: &Spot) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
     use crate::cli::add::catalog::Catalog;
     use crate::cli::computer::tests::Tree;
@@ -163,7 +165,7 @@ mod tests {
         let catalog = Catalog::read().unwrap();
         let computer = tree.computer();
         let board = catalog.board(&computer).unwrap();
-        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None).unwrap();
+        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None, &BTreeSet::new()).unwrap();
         let found = strays(&computer, board, &spot);
         assert_eq!(found.len(), 1, "{found:?}");
         assert!(found[0].starts_with("pin 19 (GPIO10 MOSI) is a GPIO line now"), "{found:?}");

@@ -176,9 +176,10 @@ fn place<'a>(
         return Ok(found);
     }
     let uses = |kind: Kind, node: &str| printer?.user(device, kind, node);
+    let taken = printer.map(|printer| printer.taken(device)).unwrap_or_default();
     let mut refusal = None;
     for way in ways {
-        match board.spot(way, &uses) {
+        match board.spot(way, &uses, &taken) {
             Ok(spot) => {
                 if let Some(why) = refusal {
                     report.set("conflict", json!(why));

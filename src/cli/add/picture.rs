@@ -120,7 +120,9 @@ mod tests {
             tree.put("proc/device-tree/model", model);
             let board = catalog.board(&tree.computer()).unwrap();
             let way = &catalog.device("adxl345").unwrap().way[0];
-            let wires = board.wires(way, &board.spot(way, &|_, _| None).unwrap(), &BTreeSet::new(), None).unwrap();
+            let wires = board
+                .wires(way, &board.spot(way, &|_, _| None, &BTreeSet::new()).unwrap(), &BTreeSet::new(), None)
+                .unwrap();
             let text = page(board, &wires).to_string();
             let rows: Vec<&str> = text.lines().skip_while(|line| !line.is_empty()).skip(1).collect();
             assert_eq!(rows.len(), board.pins.len() / 2, "{text}");
@@ -143,7 +145,9 @@ mod tests {
         tree.put("boot/system.cfg", "BTT_PAD7=\"ON\"\n");
         let board = catalog.board(&tree.computer()).unwrap();
         let way = &catalog.device("adxl345").unwrap().way[0];
-        let wires = board.wires(way, &board.spot(way, &|_, _| None).unwrap(), &BTreeSet::new(), None).unwrap();
+        let wires = board
+            .wires(way, &board.spot(way, &|_, _| None, &BTreeSet::new()).unwrap(), &BTreeSet::new(), None)
+            .unwrap();
         let text = page(board, &wires).to_string();
         assert!(text.contains("the connector SPI") && !text.contains("pin "), "{text}");
         assert!(!svg(board, "x", &wires).contains(">1<"));
