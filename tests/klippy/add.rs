@@ -70,8 +70,8 @@ fn from_nothing_to_a_measured_resonance_and_back() {
     // The chip has the bus of a Raspberry Pi's header, and printer.cfg knows nothing of it.
     let describe = |board: String, _: &Path| {
         board.replace("bus = \"spidev0.0\"", "bus = \"spidev9.0\"").replace(
-            "kind = \"adxl345\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
-            "kind = \"adxl345\"\nbus = \"spidev0.0\"",
+            "kind = \"accelerometer\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
+            "kind = \"accelerometer\"\nbus = \"spidev0.0\"",
         ) + "\n[[spi_bus]]\nname = \"spidev9.0\"\n"
     };
     let change = |config: String| without(&without(&config, "adxl345"), "resonance_tester") + UNHOMED;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::part::workshop::Part;
 use super::part::{
-    ads1220, adxl345, angle, apa102, bltouch, ds18b20, hx71x, i2c_register, i2c_sensor, ldc1612, loopback, probe,
+    accelerometer, ads1220, angle, apa102, bltouch, ds18b20, hx71x, i2c_register, i2c_sensor, ldc1612, loopback, probe,
     pwm_channel, servo, spi_dac, spool, ssd1306, thermocouple, tmc2209, tmc2660, tmc5160, ws2812,
 };
 
@@ -16,7 +16,8 @@ use super::part::{
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum PartConfig {
     /// An accelerometer.
-    Adxl345(adxl345::Adxl345Config),
+    #[serde(alias = "adxl345")]
+    Accelerometer(accelerometer::AccelerometerConfig),
     /// A thermometer on the one-wire bus.
     Ds18b20(ds18b20::Ds18b20Config),
     /// A hardware PWM channel.
@@ -76,7 +77,7 @@ impl PartConfig {
     /// The common interface of all parts.
     pub(crate) fn part(&self) -> &dyn Part {
         match self {
-            PartConfig::Adxl345(config) => config,
+            PartConfig::Accelerometer(config) => config,
             PartConfig::Ds18b20(config) => config,
             PartConfig::PwmChannel(config) => config,
             PartConfig::Loopback(config) => config,

@@ -6,6 +6,7 @@
 use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
+use super::known::is_left_over;
 use super::translate::Translator;
 
 /// How high a coil is above the nozzle's tip.
@@ -60,6 +61,7 @@ impl Translator<'_> {
 
     fn device(&mut self, section: &Section) -> Result<(), Trouble> {
         match section.kind() {
+            "probe" if is_left_over(self.config, section) => Ok(()),
             "probe" | "smart_effector" => self.probe(section),
             "bltouch" => self.bltouch(section),
             "probe_eddy_current" => self.eddy(section),
@@ -72,7 +74,7 @@ impl Translator<'_> {
             "output_pin" | "pwm_tool" | "pwm_cycle_time" => self.output(section),
             "display" => self.display(section),
             "gcode_button" => self.button(section),
-            "adxl345" => self.accelerometer(section),
+            "adxl345" | "bmi160" | "icm20948" | "lis2dw" | "lis3dh" | "mpu9250" => self.accelerometer(section),
             "angle" => self.angle(section),
             "adc_scaled" => self.scaled(section),
             "mcp4018" | "mcp4451" | "pca9533" | "pca9632" | "sx1509" => self.i2c_register(section),
@@ -308,11 +310,30 @@ impl Translator<'_> {
     }
 
     fn accelerometer(&mut self, section: &Section) -> Result<(), Trouble> {
-        section.required("cs_pin")?;
-        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+        let chip = section.kind();
+        // klippy's default addresses.
+        let usual = match chip {
+            "lis2dw" | "lis3dh" => Some(0x19),
+            "mpu9250" | "icm20948" => Some(0x68),
+            "bmi160" => Some(0x69),
+            _ => None,
+        };
+        let mut part = Entry::default().set("kind", "accelerometer").set("chip", chip);
+        part = part.set_if("name", section.own_name());
+        let is_on_spi = section.text("cs_pin").is_some() && !matches!(chip, "mpu9250" | "icm20948");
+        part = match usual.filter(|_| !is_on_spi) {
+            Some(usual) => {
+                let bus = self.i2c(section)?;
+                part.set("bus", bus).set("address", section.whole("i2c_address", 0)?.unwrap_or(usual))
+            }
+            None => {
+                section.required("cs_pin")?;
+                let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
+                part.set("bus", bus).set_if("select_pin", select)
+            }
+        };
         let shaken =
             |axis: &str, hz: f64| Entry::default().set("axis", axis).set("hz", hz).set("damping_ratio", 0.06).0;
-        let mut part = Entry::default().set("kind", "adxl345").set("bus", bus).set_if("select_pin", select);
         for (axis, hz) in [("x", 52.0), ("y", 43.0)] {
             if self.axes.values().any(|name| name == axis) {
                 part = part.set(axis, shaken(axis, hz));

@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use pinion_printer_config::Section;
+use pinion_printer_config::{Config, Section};
 
 /// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,14 +21,9 @@ const NOT_SIMULATED: &[&str] = &[
     "ads131m0x",
     "ads1x1x",
     "belay",
-    "bmi160",
     "dockable_probe",
     "hall_filament_width_sensor",
-    "icm20948",
-    "lis2dw",
-    "lis3dh",
     "mcp4728",
-    "mpu9250",
     "palette2",
     "replicape",
     "trad_rack",
@@ -50,6 +45,7 @@ const KNOWN: &[&str] = &[
     "bed_tilt",
     "bltouch",
     "bme280",
+    "bmi160",
     "board_pins",
     "bus",
     "carriage",
@@ -90,10 +86,13 @@ const KNOWN: &[&str] = &[
     "homing_heaters",
     "homing_override",
     "htu21d",
+    "icm20948",
     "idle_timeout",
     "include",
     "input_shaper",
     "led",
+    "lis2dw",
+    "lis3dh",
     "lm75",
     "load_cell",
     "load_cell_probe",
@@ -103,6 +102,7 @@ const KNOWN: &[&str] = &[
     "mcp4451",
     "mcu",
     "menu",
+    "mpu9250",
     "mixing_extruder",
     "multi_pin",
     "neopixel",
@@ -161,6 +161,17 @@ pub(crate) fn kind_of(word: &str) -> Kind {
         "tmc2130" | "tmc2208" | "tmc2209" | "tmc2240" | "tmc2660" | "tmc5160" => Kind::Known,
         _ => Kind::Strange,
     }
+}
+
+/// Whether klippy loads nothing for this [probe], because a section before it has made the probe. SAVE_CONFIG leaves such
+/// sections behind. A section of somebody's module may have made it.
+pub(super) fn is_left_over(config: &Config, section: &Section) -> bool {
+    const PROBES: [&str; 4] = ["bltouch", "load_cell_probe", "probe_eddy_current", "smart_effector"];
+    let has_made_it = |other: &Section| {
+        let is_strange = kind_of(other.kind()) == Kind::Strange && section.text("pin").is_none();
+        PROBES.contains(&other.kind()) || is_strange
+    };
+    section.name == "probe" && config.sections().iter().take_while(|other| other.name != "probe").any(has_made_it)
 }
 
 /// The name of the section of a driver's motor.

@@ -144,8 +144,9 @@ impl<'a> Translator<'a> {
         let max = section.number("position_max", Limit::Above(min))?.unwrap_or(min + 1.0);
         let by_probe = self.pin(section, "endstop_pin")?.is_some_and(|pin| pin.chip == "probe");
         let endstop = match section.number("position_endstop", Limit::Any)? {
+            // klippy takes the probe's z_offset, whatever is written here.
+            _ if by_probe => 0.0f64.clamp(min, max),
             Some(endstop) => endstop,
-            None if by_probe => 0.0f64.clamp(min, max),
             None => section.required("position_endstop").map(|_| 0.0)?,
         };
         if endstop < min || endstop > max {

@@ -7,7 +7,7 @@
 use pinion_printer_config::pins::{MAIN, Pin};
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
-use super::known::{Kind, kind_of, motor_of};
+use super::known::{Kind, is_left_over, kind_of, motor_of};
 
 /// The value of an option.
 #[derive(Clone, Copy)]
@@ -193,7 +193,7 @@ fn classes(section: &Section) -> Vec<&str> {
 ///
 /// The first one that klippy refuses, too.
 pub(super) fn check(config: &Config) -> Result<(), Trouble> {
-    for section in config.sections() {
+    for section in config.sections().iter().filter(|section| !is_left_over(config, section)) {
         let classes = classes(section);
         for (_, key, rule) in MUST.iter().filter(|(class, ..)| classes.contains(class)) {
             section.required(key)?;

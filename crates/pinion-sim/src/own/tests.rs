@@ -115,6 +115,40 @@ fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
 fn a_chip_without_a_select_pin_is_on_the_bus_of_its_mcu() {
     let text = format!("{PRINTER}[adxl345]\ncs_pin: tool:None\nspi_bus: spidev2.0\n");
     let Translated { description, .. } = translated(&text).unwrap();
-    let chip = named(&description, "part", "kind", "adxl345");
+    let chip = named(&description, "part", "kind", "accelerometer");
     assert_eq!((chip["bus"].as_str(), chip.get("select_pin")), (Some("tool:spidev2.0"), None));
+}
+
+#[test]
+fn accelerometers_have_names_and_one_of_two_buses() {
+    let text = "[adxl345 t0]\ncs_pin: PE1\n[adxl345 t1]\ncs_pin: PE2\n[lis2dw]\ncs_pin: PE3\n\
+                [lis3dh bed]\ni2c_mcu: tool\ni2c_bus: i2c1a\n[mpu9250]\ni2c_address: 105\ni2c_bus: i2c1\n";
+    let Translated { description, notes, .. } = translated(&format!("{PRINTER}{text}")).unwrap();
+    assert!(notes.is_empty(), "{notes:?}");
+    assert_eq!(named(&description, "part", "name", "t0")["select_pin"].as_str(), Some("PE1"));
+    assert_eq!(named(&description, "part", "name", "t1")["select_pin"].as_str(), Some("PE2"));
+    let lis2dw = named(&description, "part", "chip", "lis2dw");
+    assert_eq!((lis2dw["select_pin"].as_str(), lis2dw.get("address")), (Some("PE3"), None));
+    let lis3dh = named(&description, "part", "name", "bed");
+    assert_eq!((lis3dh["bus"].as_str(), lis3dh["address"].as_integer()), (Some("tool:i2c1a"), Some(0x19)));
+    assert_eq!(named(&description, "part", "chip", "mpu9250")["address"].as_integer(), Some(105));
+}
+
+#[test]
+fn a_probe_that_save_config_left_behind_is_none() {
+    let bltouch = "[bltouch]\nsensor_pin: PD5\ncontrol_pin: PD6\nz_offset: 2\n";
+    let left = "[probe]\nz_offset: 0.4\n";
+    let (before, after) = PRINTER.split_once("[probe]\n").unwrap();
+    let after = after.split_once("\n[").map_or(String::new(), |(_, after)| format!("[{after}"));
+    let text = |sections: &[&str]| format!("{before}{after}\n{}", sections.concat());
+    translated(&text(&[bltouch, left])).unwrap();
+    translated(&text(&["[beacon]\nserial: x\n", left])).unwrap();
+    assert!(translated(&text(&[left])).unwrap_err().contains("Option 'pin' in section 'probe' must be specified"));
+}
+
+#[test]
+fn a_probe_as_endstop_leaves_position_endstop_without_a_meaning() {
+    let text = PRINTER.replace("probe:z_virtual_endstop\n", "probe:z_virtual_endstop\nposition_endstop: -13.35\n");
+    assert_ne!(text, PRINTER);
+    translated(&text).unwrap();
 }

@@ -4,8 +4,8 @@
 
 #![forbid(unsafe_code)]
 
+pub(crate) mod accelerometer;
 pub(crate) mod ads1220;
-pub(crate) mod adxl345;
 pub(crate) mod angle;
 pub(crate) mod apa102;
 pub(crate) mod bltouch;

@@ -1,0 +1,182 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The accelerometer in the BMI160, after its data sheet (Bosch, BST-BMI160-DS000-09: "Register Description", "FIFO").
+//!
+//! Simulated: identification, the accelerometer's power mode, rates, ranges, the FIFO without headers and its length. Other
+//! registers hold what is written. Not simulated: gyroscope, headers, filters, interrupts, the choice of the bus by its
+//! first message.
+
+#![forbid(unsafe_code)]
+
+use super::Chip;
+use super::head::{Fifo, Head, Room, value};
+
+const CHIP_ID: u8 = 0x00;
+const ID: u8 = 0xd1;
+const PMU_STATUS: u8 = 0x03;
+const FIFO_LENGTH: u8 = 0x22;
+const FIFO_DATA: u8 = 0x24;
+const ACC_CONF: u8 = 0x40;
+const ACC_RANGE: u8 = 0x41;
+const FIFO_CONFIG_1: u8 = 0x47;
+const CMD: u8 = 0x7e;
+
+/// Commands.
+const ACC_SUSPEND: u8 = 0x10;
+const ACC_NORMAL: u8 = 0x11;
+const FIFO_FLUSH: u8 = 0xb0;
+/// FIFO_CONFIG_1: accelerations without headers.
+const FIFO_ACC: u8 = 0x40;
+const FIFO_HEADER: u8 = 0x10;
+/// The accelerometer in PMU_STATUS.
+const NORMAL: u8 = 0x10;
+/// Bytes of the FIFO, and of a sample.
+const FIFO: usize = 1024;
+const SAMPLE: usize = 6;
+/// Registers that do not start as zero.
+const RESETS: [(u8, u8); 6] =
+    [(CHIP_ID, ID), (ACC_CONF, 0x28), (ACC_RANGE, 0x03), (0x45, 0x88), (0x46, 0x80), (FIFO_CONFIG_1, FIFO_HEADER)];
+
+pub(super) struct Bmi160 {
+    head: Head,
+    registers: [u8; 0x80],
+    fifo: Fifo,
+    /// Bytes of the oldest sample that were read.
+    taken: usize,
+}
+
+impl Bmi160 {
+    pub(super) fn new(head: Head) -> Bmi160 {
+        let mut registers = [0; 0x80];
+        RESETS.iter().for_each(|(register, reset)| registers[usize::from(*register)] = *reset);
+        Bmi160 { head, registers, fifo: Fifo::new(FIFO / SAMPLE), taken: 0 }
+    }
+
+    fn get(&self, register: u8) -> u8 {
+        self.registers[usize::from(register & 0x7f)]
+    }
+
+    fn catch_up(&mut self) {
+        let room = Room { samples: FIFO / SAMPLE, replaces: true };
+        let lsb_per_g = match self.get(ACC_RANGE) & 0x0f {
+            0x05 => 8192.0,
+            0x08 => 4096.0,
+            0x0c => 2048.0,
+            _ => 16384.0,
+        };
+        self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
+        if self.get(FIFO_CONFIG_1) & (FIFO_ACC | FIFO_HEADER) != FIFO_ACC {
+            self.fifo.clear();
+        }
+        if std::mem::take(&mut self.fifo.overrun) {
+            self.taken = 0;
+        }
+    }
+
+    fn set_up(&mut self) {
+        // Code 8 is 100 samples a second, and each code doubles it.
+        let rate_hz = 100.0 * f64::from(1u32 << (self.get(ACC_CONF) & 0x0f)) / 256.0;
+        let is_on = self.get(PMU_STATUS) & NORMAL != 0;
+        self.head.measure(is_on.then_some(rate_hz));
+    }
+}
+
+impl Chip for Bmi160 {
+    const SPI_MODES: &'static [u8] = &[0, 3];
+
+    fn register(&self, first: u8, _is_spi: bool) -> (u8, bool) {
+        (first & 0x7f, true)
+    }
+
+    fn begin(&mut self) {
+        self.catch_up();
+    }
+
+    fn read(&mut self, register: u8) -> u8 {
+        let [low, high] = ((self.fifo.samples.len() * SAMPLE - self.taken) as u16).to_le_bytes();
+        match register {
+            FIFO_LENGTH => low,
+            register if register == FIFO_LENGTH + 1 => high,
+            FIFO_DATA => {
+                let byte = self.fifo.front()[self.taken / 2].to_le_bytes()[self.taken % 2];
+                if !self.fifo.samples.is_empty() {
+                    self.taken = (self.taken + 1) % SAMPLE;
+                    if self.taken == 0 {
+                        self.fifo.pop();
+                    }
+                }
+                byte
+            }
+            _ => self.get(register),
+        }
+    }
+
+    fn write(&mut self, register: u8, value: u8) {
+        match (register, value) {
+            (CMD, ACC_NORMAL | ACC_SUSPEND) => {
+                self.registers[usize::from(PMU_STATUS)] = if value == ACC_NORMAL { NORMAL } else { 0 };
+                self.set_up();
+            }
+            (CMD, FIFO_FLUSH) => {
+                self.fifo.clear();
+                self.taken = 0;
+            }
+            (ACC_CONF.., _) => {
+                self.registers[usize::from(register & 0x7f)] = value;
+                if register == ACC_CONF {
+                    self.set_up();
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn next(&mut self, register: u8) -> u8 {
+        // The FIFO's bytes all come from one register.
+        if register == FIFO_DATA { register } else { (register + 1) & 0x7f }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::READ;
+    use super::super::head::TURN_ON_S;
+    use super::super::tests::Bench;
+    use super::*;
+
+    /// klippy's writes before a measurement.
+    const KLIPPY: [(u8, u8); 6] =
+        [(CMD, 0x11), (ACC_CONF, 0x2c), (ACC_RANGE, 0x0c), (0x45, 0), (FIFO_CONFIG_1, 0x40), (CMD, 0xb0)];
+
+    #[test]
+    fn klippys_settings_give_its_samples_on_both_buses() {
+        for is_spi in [true, false] {
+            let mut bench = Bench::new(0.0, Bmi160::new);
+            assert_eq!(bench.read(CHIP_ID), ID);
+            for (register, value) in KLIPPY {
+                if is_spi { bench.write(register, value) } else { bench.i2c_write(register, value) }
+            }
+            assert_eq!(bench.read(ACC_CONF), 0x2c, "klippy reads it back");
+            bench.wait(TURN_ON_S + 10.5 / 1600.0);
+            let length = |bench: &mut Bench<Bmi160>| u16::from_le_bytes(bench.i2c_read(FIFO_LENGTH));
+            assert_eq!(length(&mut bench), 60);
+            let bytes: [u8; 48] = if is_spi {
+                let mut message = [0; 49];
+                message[0] = FIFO_DATA | READ;
+                bench.exchange(message)[1..].try_into().unwrap()
+            } else {
+                bench.i2c_read(FIFO_DATA)
+            };
+            for sample in bytes.as_chunks::<6>().0 {
+                let [x, y, z] = [0, 2, 4].map(|at| i16::from_le_bytes([sample[at], sample[at + 1]]));
+                assert_eq!([x, y, z], [0, 0, 2048]);
+            }
+            assert_eq!(length(&mut bench), 12);
+            bench.wait(1.0);
+            assert_eq!(length(&mut bench), 1020, "it is full");
+            bench.write(CMD, ACC_SUSPEND);
+            bench.write(CMD, FIFO_FLUSH);
+            bench.wait(1.0);
+            assert_eq!(length(&mut bench), 0, "it is switched off");
+        }
+    }
+}
