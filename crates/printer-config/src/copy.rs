@@ -17,11 +17,13 @@ use crate::{Config, Trouble};
 /// The folder for files that are not below the main one's folder.
 const OUTSIDE: &str = "outside";
 
-/// Options of a section that the copy has in place of others.
+/// A section that is another one in the copy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Change {
     /// The whole name of the section.
     pub section: String,
+    /// It is left out as a whole. Otherwise only options are.
+    pub left_out: bool,
     /// The options that go.
     pub without: Vec<String>,
     /// The options that come.
@@ -69,13 +71,9 @@ fn changed(
     let mut lines: Vec<String> = text.split('\n').map(str::to_owned).collect();
     let change_of = |section: &str| changes.iter().find(|change| change.section == section);
     for entry in config.entries.iter().filter(|entry| entry.file == *path) {
-        if !change_of(&config.sections[entry.section].name).is_some_and(|change| change.without.contains(&entry.key)) {
-            continue;
-        }
-        for number in entry.lines.clone() {
-            if let Some(line) = lines.get_mut(number - 1).filter(|line| !line.starts_with("# ")) {
-                line.insert_str(0, "# ");
-            }
+        let change = change_of(&config.sections[entry.section].name);
+        if change.is_some_and(|change| change.left_out || change.without.contains(&entry.key)) {
+            entry.lines.clone().for_each(|number| comment_out(&mut lines, number));
         }
     }
     for include in config.includes.iter().filter(|include| include.place.file == *path) {
@@ -94,7 +92,14 @@ fn changed(
         }
     }
     for (name, place) in config.headers.iter().filter(|(_, place)| place.file == *path) {
-        let Some(change) = change_of(name).filter(|_| opened.insert(name.clone())) else { continue };
+        let Some(change) = change_of(name) else { continue };
+        if change.left_out {
+            comment_out(&mut lines, place.line);
+            continue;
+        }
+        if !opened.insert(name.clone()) {
+            continue;
+        }
         if let Some(line) = lines.get_mut(place.line - 1) {
             for (key, value) in &change.with {
                 line.push_str(&format!("\n{key}: {value}"));
@@ -102,4 +107,10 @@ fn changed(
         }
     }
     lines.join("\n")
+}
+
+fn comment_out(lines: &mut [String], number: usize) {
+    if let Some(line) = lines.get_mut(number - 1).filter(|line| !line.starts_with("# ")) {
+        line.insert_str(0, "# ");
+    }
 }

@@ -205,6 +205,7 @@ fn a_copy_differs_only_where_it_is_told_and_stays_in_its_folder() {
     let config = Config::read(&home.join("printer.cfg")).unwrap();
     let change = |section: &str, serial: &str| Change {
         section: section.into(),
+        left_out: false,
         without: ["serial", "baud", "canbus_uuid"].map(Into::into).into(),
         with: vec![("serial".into(), serial.into())],
     };
@@ -219,4 +220,17 @@ fn a_copy_differs_only_where_it_is_told_and_stays_in_its_folder() {
     assert_eq!(again.section("mcu z").unwrap().text("serial"), Some("/tmp/z"));
     assert_eq!(again.section("shared").unwrap().text("x"), Some("1"));
     assert_eq!(fs::read_to_string(home.join("printer.cfg")).unwrap(), main, "the original");
+}
+
+#[test]
+fn a_copy_without_a_section_has_none_of_its_lines() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("printer.cfg");
+    fs::write(&path, "[a]\nx: 1\n  2\n[b]  # b\n[a]\n# y\ny: 3\n").unwrap();
+    let config = Config::read(&path).unwrap();
+    let gone = Change { section: "a".into(), left_out: true, without: Vec::new(), with: Vec::new() };
+    let copied = write(&config, &[gone], &folder.path().join("copy")).unwrap();
+    let text = fs::read_to_string(&copied).unwrap();
+    assert_eq!(text, "# [a]\n# x: 1\n#   2\n[b]  # b\n# [a]\n# y\n# y: 3\n");
+    assert!(Config::read(&copied).unwrap().section("a").is_none());
 }

@@ -904,9 +904,8 @@ fn coordinates(list: &Value) -> [f64; 3] {
 /// # Errors
 ///
 /// There is none.
-pub(crate) fn klipper(named: Option<&Path>) -> Result<PathBuf, Trouble> {
-    let usual = || std::env::var_os("KLIPPER_DIR").map(PathBuf::from);
-    named.map(Path::to_owned).or_else(usual).ok_or_else(|| {
+pub(crate) fn klipper(named: Option<PathBuf>) -> Result<PathBuf, Trouble> {
+    named.ok_or_else(|| {
         Trouble::new("--try needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
     })
 }

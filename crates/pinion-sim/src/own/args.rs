@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 
@@ -47,6 +47,10 @@ pub(crate) struct OwnArgs {
     /// The folder for klippy's copy and its logs; a new one in /tmp by default
     #[arg(long, value_name = "DIR", conflicts_with = "in_place_pty")]
     pub(crate) folder: Option<PathBuf>,
+    /// Leave the sections out of klippy's copy for which it has no module, for example [shaketune]. Without --klipper:
+    /// which neither Klipper nor Kalico has
+    #[arg(long, conflicts_with = "in_place_pty")]
+    pub(crate) without_plugins: bool,
     /// Make no copy: put each pty where `serial` of printer.cfg expects it
     #[arg(long, conflicts_with = "attempt")]
     pub(crate) in_place_pty: bool,
@@ -55,7 +59,12 @@ pub(crate) struct OwnArgs {
 impl OwnArgs {
     /// Whether an option needs a printer.cfg.
     pub(crate) fn is_used(&self) -> bool {
-        self.attempt || self.built_like.is_some() || self.with.is_some() || self.folder.is_some() || self.in_place_pty
+        self.attempt
+            || self.built_like.is_some()
+            || self.with.is_some()
+            || self.folder.is_some()
+            || self.in_place_pty
+            || self.without_plugins
     }
 
     pub(crate) fn pace(&self) -> Pace {
@@ -68,8 +77,8 @@ impl OwnArgs {
     }
 
     /// The klippy that is named, for the command that a user copies.
-    pub(crate) fn klipper(&self) -> Option<&Path> {
-        self.klipper.as_deref()
+    pub(crate) fn klipper(&self) -> Option<PathBuf> {
+        self.klipper.clone().or_else(|| std::env::var_os("KLIPPER_DIR").map(PathBuf::from))
     }
 
     /// The options of `--try`, if it is given.
@@ -81,7 +90,7 @@ impl OwnArgs {
         if !self.attempt {
             return Ok(None);
         }
-        let klipper = attempt::klipper(self.klipper.as_deref())?;
+        let klipper = attempt::klipper(self.klipper())?;
         let python = attempt::python(self.python.as_deref(), &klipper);
         Ok(Some(Attempt {
             klipper,

@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+use std::path::Path;
+
 use pinion_printer_config::{Config, Section};
 
 /// The meaning of a section here.
@@ -150,17 +152,46 @@ const KNOWN: &[&str] = &[
     "z_tilt_ng",
 ];
 
+fn is_numbered(word: &str, prefix: &str) -> bool {
+    word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))
+}
+
 /// The meaning of sections with this first word.
 pub(crate) fn kind_of(word: &str) -> Kind {
-    let is_numbered = |prefix: &str| {
-        word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))
-    };
     match word {
         _ if NOT_SIMULATED.contains(&word) => Kind::NotSimulated,
-        _ if KNOWN.contains(&word) || word.starts_with("stepper_") || is_numbered("extruder") => Kind::Known,
+        _ if KNOWN.contains(&word) || word.starts_with("stepper_") || is_numbered(word, "extruder") => Kind::Known,
         "tmc2130" | "tmc2208" | "tmc2209" | "tmc2240" | "tmc2660" | "tmc5160" => Kind::Known,
         _ => Kind::Strange,
     }
+}
+
+/// Sections of klippy without a module of their own.
+const WITHOUT_MODULE: &[&str] = &[
+    "carriage",
+    "constants",
+    "display_data",
+    "display_glyph",
+    "display_template",
+    "dual_carriage",
+    "extra_carriage",
+    "mcu",
+    "menu",
+    "pid_profile",
+    "printer",
+    "stepper",
+];
+
+/// Whether a klippy has no module for sections with this first word. Without a checkout, whether neither Klipper nor Kalico
+/// has.
+pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
+    let Some(klipper) = klipper else { return kind_of(word) == Kind::Strange };
+    let is_built_in = WITHOUT_MODULE.contains(&word) || word.starts_with("stepper_") || is_numbered(word, "extruder");
+    let has = |folder: &str| {
+        let module = klipper.join("klippy").join(folder).join(word);
+        module.with_extension("py").exists() || module.join("__init__.py").exists()
+    };
+    !is_built_in && !["extras", "plugins"].into_iter().any(has)
 }
 
 /// Whether klippy loads nothing for this [probe], because a section before it has made the probe. SAVE_CONFIG leaves such
@@ -177,4 +208,28 @@ pub(super) fn is_left_over(config: &Config, section: &Section) -> bool {
 /// The name of the section of a driver's motor.
 pub(super) fn motor_of(driver: &Section) -> &str {
     driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_module_may_be_a_file_or_a_folder_of_extras_or_plugins() {
+        let klipper = tempfile::tempdir().unwrap();
+        let extras = klipper.path().join("klippy/extras");
+        std::fs::create_dir_all(extras.join("display")).unwrap();
+        std::fs::create_dir_all(klipper.path().join("klippy/plugins")).unwrap();
+        for file in ["extras/bltouch.py", "extras/display/__init__.py", "plugins/beacon.py"] {
+            std::fs::write(klipper.path().join("klippy").join(file), "").unwrap();
+        }
+        let lacks = |word: &str| lacks_module(word, Some(klipper.path()));
+        for word in ["bltouch", "display", "beacon", "stepper_x", "extruder1", "mcu", "printer"] {
+            assert!(!lacks(word), "{word}");
+        }
+        for word in ["shaketune", "gcode_shell_command", "extruder_fan"] {
+            assert!(lacks(word), "{word}");
+        }
+        assert!(lacks_module("shaketune", None) && !lacks_module("gcode_shell_command", None));
+    }
 }

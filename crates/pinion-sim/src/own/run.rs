@@ -12,6 +12,7 @@ use pinion_printer_config::Trouble;
 use toml::Table;
 
 use super::args::OwnArgs;
+use super::known::lacks_module;
 use super::serve::{Folder, Own, section_of};
 use crate::description::text;
 
@@ -57,7 +58,15 @@ impl Place {
         if args.in_place_pty {
             return own.mcus.iter().map(|mcu| in_place(own, mcu)).collect::<Result<_, _>>().map(Place::InPlace);
         }
-        Folder::make(own, args.folder.as_deref(), link).map(Place::Folder)
+        let sections = own.config.sections().iter();
+        let left_out: Vec<&str> = sections
+            .filter(|section| args.without_plugins && lacks_module(section.kind(), args.klipper().as_deref()))
+            .map(|section| section.name.as_str())
+            .collect();
+        if !left_out.is_empty() {
+            log::info!("klippy's copy is without [{}]", left_out.join("], ["));
+        }
+        Folder::make(own, &left_out, args.folder.as_deref(), link).map(Place::Folder)
     }
 
     /// The links of all MCUs, the main one's first.
@@ -73,7 +82,7 @@ impl Place {
         match self {
             Place::Folder(folder) => vec![
                 format!("The printer waits for klippy. Its copy of printer.cfg is {}:", folder.printer_cfg.display()),
-                format!("  {}", folder.command(args.klipper())),
+                format!("  {}", folder.command(args.klipper().as_deref())),
             ],
             Place::InPlace(links) => {
                 let links: Vec<String> = links.iter().map(|link| link.display().to_string()).collect();

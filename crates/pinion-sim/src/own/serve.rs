@@ -147,12 +147,18 @@ pub(crate) fn section_of(mcu: &str) -> String {
 }
 
 impl Folder {
-    /// Makes the folder and the copy. `link` is the main MCU's link, if it is not in the folder.
+    /// Makes the folder and the copy, without the sections `left_out`. `link` is the main MCU's link, if it is not in the
+    /// folder.
     ///
     /// # Errors
     ///
     /// It cannot be written, or has files of somebody else.
-    pub(super) fn make(own: &Own, named: Option<&Path>, link: Option<&Path>) -> Result<Folder, Trouble> {
+    pub(super) fn make(
+        own: &Own,
+        left_out: &[&str],
+        named: Option<&Path>,
+        link: Option<&Path>,
+    ) -> Result<Folder, Trouble> {
         let path = match named {
             Some(named) => new_or_ours(named)?,
             None => nix::unistd::mkdtemp("/tmp/pinion-sim-XXXXXX").map_err(|error| {
@@ -169,12 +175,14 @@ impl Folder {
         let links = links_of(&main, own.mcus.iter().map(String::as_str));
         let served = |(mcu, link): (&String, &PathBuf)| Change {
             section: section_of(mcu),
+            left_out: false,
             without: WAYS.map(str::to_owned).to_vec(),
             with: vec![("serial".into(), link.display().to_string()), ("restart_method".into(), "command".into())],
         };
         let mut changes: Vec<Change> = own.mcus.iter().zip(&links).map(served).collect();
         let elsewhere = |section: &str, key: &str, value: &Path| Change {
             section: section.into(),
+            left_out: false,
             without: vec![key.into()],
             with: vec![(key.into(), value.display().to_string())],
         };
@@ -195,6 +203,12 @@ impl Folder {
             }
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
+        changes.extend(left_out.iter().map(|section| Change {
+            section: (*section).to_owned(),
+            left_out: true,
+            without: Vec::new(),
+            with: Vec::new(),
+        }));
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
         Ok(Folder { path, printer_cfg, links })
     }

@@ -263,7 +263,8 @@ impl Translator<'_> {
                     self.note(section, "is not simulated", "its pins exist, and nothing is at them");
                 }
                 Kind::Strange => {
-                    let remedy = "klippy needs its module; its pins exist, and nothing is at them";
+                    let remedy =
+                        "klippy needs its module, or give --without-plugins; its pins exist, and nothing is at them";
                     self.note(section, "is no section of Klipper or Kalico", remedy);
                 }
             }
