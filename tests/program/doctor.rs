@@ -304,8 +304,8 @@ fn checks_that_a_wrong_printer_cfg_leaves_out_are_named_with_its_line() {
         ("[include printer.cfg]\n", "5: Recursive include of config file '/home/pi/printer.cfg'", "remove the line\n"),
         (
             "[include a.cfg]\n",
-            "5: /home/pi/a.cfg: Unable to open config file: No such file or directory (os error 2)",
-            "correct its name\n",
+            "5: Include file '/home/pi/a.cfg' does not exist",
+            "correct its name, or remove the line\n",
         ),
     ] {
         let text = doctor(&format!("{uart}{wrong}"));

@@ -64,7 +64,8 @@ impl Files for Disk {
                 Some(Err(_)) | None => found.into_iter().map(|path| path.join(component)).collect(),
             };
         }
-        found.retain(|path| path.exists());
+        // Python finds a link that leads nowhere, too.
+        found.retain(|path| path.symlink_metadata().is_ok());
         found.sort();
         Ok(found)
     }

@@ -63,7 +63,7 @@ impl Files for Readable<'_> {
     }
 
     fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        Files::matching(self.computer, pattern)
+        Ok(self.computer.matching(pattern).iter().map(|file| self.computer.name(file)).collect())
     }
 
     fn whole(&self, path: &Path) -> PathBuf {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A small print in the middle of any bed.
+//! The G-code of a small print in the middle of any bed.
 
 #![forbid(unsafe_code)]
 

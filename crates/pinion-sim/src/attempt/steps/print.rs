@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A print, and the path of the nozzle against the file.
+
+#![forbid(unsafe_code)]
+
+use std::io::BufReader;
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::thread;
+use std::time::Duration;
+
+use pinion::cli::files;
+use pinion_firmware::time::{Clock, Ticks};
+use pinion_sim::{AskedPath, Recorder, compare};
+
+use super::heaters::{targets, until_hot};
+use super::square::square;
+use super::{Seen, skipped};
+use crate::attempt::host::Refused;
+use crate::attempt::report::Outcome;
+use crate::attempt::trial::{LONG, Trial, travel};
+
+/// How long a print may take.
+const PRINT: Duration = Duration::from_secs(4 * 3600);
+/// Longest G-code file.
+const GCODE_MIB: u64 = 256;
+/// Distance above which a print is wrong.
+const WITHIN_MM: f64 = 0.1;
+
+pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
+    if !trial.has("extruder") {
+        return skipped("there is no extruder");
+    }
+    let (low, high) = travel(&trial.toolhead()?);
+    let (name, text) = match &trial.attempt.gcode {
+        Some(path) => match files::read(path, GCODE_MIB) {
+            Ok(bytes) => (path.display().to_string(), String::from_utf8_lossy(&bytes).into_owned()),
+            Err(error) => return Err(trial.failed(format!("{}: {error}", path.display()), None)),
+        },
+        None => ("a small square".to_owned(), square(low, high)),
+    };
+    let asked = AskedPath::read(BufReader::new(text.as_bytes()), &name);
+    let asked = asked.map_err(|trouble| trial.failed(trouble.to_string(), None))?;
+    prepare(trial)?;
+    let before = trial.lost();
+    let (sent, recorder) = recorded(trial, |trial| {
+        let lines: Vec<&str> = text.lines().collect();
+        for block in lines.chunks(200) {
+            send(trial, &block.join("\n"))?;
+        }
+        trial.gcode("M400", PRINT)
+    })?;
+    let compared = compare(recorder.points(), &asked);
+    trial.path = Some(recorder);
+    sent?;
+    trial.lost_none_since(&before)?;
+    let found = compared.map_err(|trouble| trial.failed(trouble.to_string(), None))?;
+    let (mm, line) = (found.all.greatest_mm, found.all.line);
+    if mm > WITHIN_MM {
+        return Err(trial.failed(format!("{name}, line {line}: the nozzle was {mm:.3} mm off"), None));
+    }
+    if let Some(line) = found.ends_at_line {
+        return Err(trial.failed(format!("{name}: the path ends at line {line}"), None));
+    }
+    Ok(format!("{name}: {:.0} mm, at most {mm:.3} mm off", found.all.length_mm))
+}
+
+/// Homes and heats for the small square. A file of the user does that itself.
+fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
+    if trial.has("pause_resume") {
+        trial.gcode("CLEAR_PAUSE", LONG)?;
+    }
+    if trial.config().section("input_shaper").is_some() {
+        // A shaper rounds corners, as it should.
+        trial.gcode("SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0", LONG)?;
+    }
+    if trial.attempt.gcode.is_some() {
+        return Ok(());
+    }
+    let hot = targets(trial).into_iter().find(|(name, _)| name == "extruder");
+    trial.gcode("G28", LONG)?;
+    if let Some((_, target)) = hot {
+        trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER=extruder TARGET={target}"), LONG)?;
+    }
+    until_hot(trial, "extruder")
+}
+
+/// Records the path of the nozzle while a print runs. Returns the print's result, too.
+fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
+    let (stop, stopped) = mpsc::channel::<()>();
+    let mut recorder = trial.probe.recorder();
+    let watched = trial.probe.clone();
+    let recording = thread::spawn(move || {
+        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
+            recorder.read(watched.now());
+        }
+        let late = u64::from(Ticks::from_ms(450).0);
+        recorder.read(Clock::from_ticks(watched.now().ticks() + late));
+        recorder
+    });
+    let printed = print(trial);
+    thread::sleep(Duration::from_millis(600));
+    drop(stop);
+    match recording.join() {
+        Ok(recorder) => Ok((printed, recorder)),
+        Err(_) => Err(trial.failed("the path was not recorded", None)),
+    }
+}
+
+/// Sends a block of a file.
+fn send(trial: &mut Trial<'_>, block: &str) -> Result<(), Outcome> {
+    match trial.host.gcode(block, PRINT) {
+        Ok(()) => Ok(()),
+        Err(Refused::Error(words)) => {
+            let words = trial.why(words);
+            Err(trial.failed(words, None))
+        }
+        Err(refused) => Err(trial.failed(format!("the print stopped: {refused:?}"), None)),
+    }
+}

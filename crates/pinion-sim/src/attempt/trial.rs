@@ -1,0 +1,297 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A klippy on the user's configuration: its commands, its restarts, and what a step asks it and the printer.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use pinion_printer_config::{Config, Place, Section, Trouble};
+use pinion_sim::{Recorder, SimProbe, write_svg};
+use serde_json::Value;
+
+use super::Attempt;
+use super::host::{Host, Refused};
+use super::place::place_of;
+use super::report::Outcome;
+use super::steps::{Step, is_first};
+use crate::camera::picture;
+use crate::own::serve::{Folder, Own, section_of};
+
+/// How long homing, leveling or a macro may take.
+pub(super) const LONG: Duration = Duration::from_secs(400);
+/// How long it may take until a fan turns or a heater cools.
+pub(super) const SOON: Duration = Duration::from_secs(30);
+/// How long klippy has to be ready.
+const READY: Duration = Duration::from_secs(90);
+/// How long klippy has to learn the MCUs' clocks, and how far off an MCU's rate may be.
+const CLOCKS: Duration = Duration::from_secs(10);
+const CLOCKS_OFF: f64 = 1e-4;
+
+/// Words of a stop because a computer is too busy.
+const BUSY: [&str; 6] = [
+    "Timer too close",
+    "Rescheduled timer in the past",
+    "Missed scheduling of next",
+    "Lost communication with MCU",
+    "Communication timeout during homing",
+    "Timeout on wait for",
+];
+/// How often a step is repeated because of them.
+const TRIES: u32 = 4;
+
+/// Shortest wait for a processor that klippy can stop for: while it homes with several MCUs, it has 25 ms.
+const STALL: Duration = Duration::from_millis(20);
+
+/// What is tried, and how far it came.
+pub(super) struct Trial<'a> {
+    pub(super) attempt: &'a Attempt,
+    folder: &'a Folder,
+    pub(super) own: &'a Own,
+    pub(super) probe: &'a SimProbe,
+    pub(super) host: Host,
+    /// klippy's objects.
+    pub(super) objects: Vec<String>,
+    /// The path of the print.
+    pub(super) path: Option<Recorder>,
+    /// Why nothing more can be tried.
+    pub(super) broken: Option<String>,
+}
+
+impl<'a> Trial<'a> {
+    pub(super) fn new(attempt: &'a Attempt, folder: &'a Folder, own: &'a Own, probe: &'a SimProbe, host: Host) -> Self {
+        Trial { attempt, folder, own, probe, host, objects: Vec::new(), path: None, broken: None }
+    }
+
+    /// Writes the camera's picture, and the path of the print, into the folder.
+    pub(super) fn keep(&mut self) -> Result<(), Trouble> {
+        let place = |name| self.folder.path.join(name);
+        let failed = |path: PathBuf, error: io::Error| {
+            Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("free space")
+        };
+        if let Some(path) = &self.path {
+            let file = place("path.svg");
+            let mut drawing = Vec::new();
+            let drawn = write_svg(path.points(), path.filament_step_mm(), &mut drawing);
+            drawn.and_then(|()| fs::write(&file, drawing)).map_err(|error| failed(file, error))?;
+        }
+        let path = self.path.take().unwrap_or_else(|| self.probe.recorder());
+        if let Some(jpeg) = picture(&self.own.sim, self.probe, path) {
+            let file = place("picture.jpg");
+            fs::write(&file, jpeg).map_err(|error| failed(file, error))?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn failed(&self, cause: impl Into<String>, place: Option<Place>) -> Outcome {
+        let cause = cause.into();
+        let place = place.or_else(|| place_of(self.config(), &cause));
+        // klippy's words have several lines, of which the first ones say it.
+        let lines: Vec<&str> = cause.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+        let cause = lines.iter().take(2).copied().collect::<Vec<&str>>().join(" ");
+        Outcome::Failed { cause, place }
+    }
+
+    /// klippy's words about a refusal: those about its stop, if it stopped.
+    pub(super) fn why(&mut self, words: String) -> String {
+        match self.host.state() {
+            Ok((state, about)) if state != "ready" => about,
+            _ => words,
+        }
+    }
+
+    /// Runs G-code. The error is the outcome.
+    pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
+        match self.host.gcode(script, limit) {
+            Ok(()) => Ok(()),
+            Err(Refused::Error(words)) => {
+                let words = self.why(words);
+                Err(self.failed(format!("{script}: {words}"), None))
+            }
+            Err(Refused::Late) => {
+                self.host.stop();
+                Err(self.failed(format!("{script}: it takes longer than {} s", limit.as_secs()), None))
+            }
+            Err(Refused::Gone(why)) => {
+                self.broken = Some("klippy ended".into());
+                Err(self.failed(format!("{script}: klippy is gone: {why}"), None))
+            }
+        }
+    }
+
+    /// Runs a step. It is repeated if klippy stopped because it or an MCU was late. If this computer made them late each
+    /// time, the step says nothing about the printer. Any other failure of a late klippy is tried once more: a probe that
+    /// answers late homes at another height.
+    pub(super) fn tried(&mut self, step: &Step) -> Outcome {
+        let mut repeated = 0;
+        loop {
+            self.host.stalls.take();
+            let outcome = (step.run)(self).map_or_else(|outcome| outcome, Outcome::Passed);
+            let stall = self.host.stalls.take();
+            let Outcome::Failed { cause, .. } = &outcome else { return outcome };
+            if self.broken.is_some() {
+                return outcome;
+            }
+            let is_busy = BUSY.iter().any(|words| cause.contains(words));
+            let is_late = stall >= STALL;
+            let repeats = if is_busy { TRIES } else { u32::from(is_late) };
+            if repeated >= repeats || !self.begins_again(step.name) {
+                let is_slow = is_busy && is_late;
+                return if is_slow { Outcome::Slow { cause: cause.clone(), stall } } else { outcome };
+            }
+            repeated += 1;
+        }
+    }
+
+    /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
+    fn restart(&mut self) -> Result<(), Trouble> {
+        self.host.end();
+        self.host = Host::start(self.attempt, self.folder)?;
+        Ok(())
+    }
+
+    /// After a failure: goes on if klippy is ready, or is so after a restart.
+    pub(super) fn recover(&mut self, step: &str) {
+        if self.broken.is_some() {
+            return;
+        }
+        let state = self.host.state().map(|(state, _)| state).unwrap_or_default();
+        if state == "ready" {
+            if step == "homed" {
+                self.broken = Some("it is not homed".into());
+            }
+            return;
+        }
+        if is_first(step) || !self.begins_again(step) {
+            self.broken = Some("klippy is not ready".into());
+        }
+    }
+
+    /// Starts another klippy, and homes unless a step does that itself. Returns whether this worked.
+    fn begins_again(&mut self, step: &str) -> bool {
+        self.restart().is_ok()
+            && self.until_ready_again().is_ok()
+            && (is_first(step) || self.host.gcode("G28", LONG).is_ok())
+    }
+
+    /// Waits until klippy is ready. The error is its words.
+    pub(super) fn until_ready(&mut self) -> Result<(), String> {
+        let until = Instant::now() + READY;
+        loop {
+            match self.host.state() {
+                Ok((state, _)) if state == "ready" => {
+                    self.until_clocks_agree();
+                    return Ok(());
+                }
+                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
+                Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
+                Ok(_) => thread::sleep(Duration::from_millis(100)),
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
+                Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
+            }
+        }
+    }
+
+    /// Waits until klippy knows the MCUs' clocks. Right after its start on a busy computer it can be milliseconds wrong, and
+    /// then it is late when it homes.
+    fn until_clocks_agree(&mut self) {
+        let names: Vec<String> = self.own.mcus.iter().map(|mcu| section_of(mcu)).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let until = Instant::now() + CLOCKS;
+        while Instant::now() < until {
+            let status = self.host.query(&names).unwrap_or_default();
+            let off = |mcu: &Value| {
+                let [now, nominal] =
+                    [&mcu["last_stats"]["freq"], &mcu["mcu_constants"]["CLOCK_FREQ"]].map(Value::as_f64);
+                now.zip(nominal).is_none_or(|(now, nominal)| (now / nominal - 1.0).abs() > CLOCKS_OFF)
+            };
+            if !names.iter().any(|name| off(&status[*name])) {
+                return;
+            }
+            thread::sleep(Duration::from_millis(200));
+        }
+    }
+
+    /// The same for another klippy. Some wait for the user if they find an MCU shut down.
+    fn until_ready_again(&mut self) -> Result<(), String> {
+        match self.until_ready() {
+            Err(words) if words.contains("is shutdown") => {
+                self.host.firmware_restart();
+                self.until_ready()
+            }
+            ready => ready,
+        }
+    }
+
+    pub(super) fn config(&self) -> &'a Config {
+        &self.own.config
+    }
+
+    /// The place of a section.
+    pub(super) fn place(&self, section: &str) -> Option<Place> {
+        self.config().section(section).map(|section| section.place.clone())
+    }
+
+    /// Whether klippy has this object.
+    pub(super) fn has(&self, object: &str) -> bool {
+        self.objects.iter().any(|name| name == object)
+    }
+
+    /// klippy's objects of a kind, by their own names.
+    pub(super) fn named(&self, kind: &str) -> Vec<String> {
+        let names = self.objects.iter().filter_map(|name| name.strip_prefix(kind)?.strip_prefix(' '));
+        names.map(str::to_owned).collect()
+    }
+
+    /// The lost steps of each axis.
+    pub(super) fn lost(&self) -> Vec<(String, u64)> {
+        self.probe.axes().map(|axis| (axis.name.to_owned(), axis.lost_steps)).collect()
+    }
+
+    /// Fails if an axis lost steps since then. An axis that homes by its driver's StallGuard has to, and the motors that
+    /// share its belts, too.
+    pub(super) fn lost_none_since(&self, before: &[(String, u64)]) -> Result<(), Outcome> {
+        let config = self.config();
+        let homes_by_stall =
+            |section: &Section| section.text("endstop_pin").is_some_and(|pin| pin.trim_start().starts_with("tmc"));
+        let kinematics = self.kinematics().unwrap_or_default();
+        let on_belts =
+            |name: &str| kinematics.contains("core") && (kinematics.ends_with("xz") || !name.starts_with('z'));
+        let any = config.sections().iter().any(homes_by_stall);
+        let stalls = |name: &str| {
+            let sections = [format!("stepper_{name}"), name.to_owned()];
+            (any && on_belts(name)) || sections.iter().filter_map(|name| config.section(name)).any(homes_by_stall)
+        };
+        let lost = self.lost().into_iter().zip(before).find(|((name, now), (_, then))| now > then && !stalls(name));
+        lost.map_or(Ok(()), |((name, now), (_, then))| {
+            let cause = format!("axis {name} lost {} steps at an end of its travel", now - then);
+            Err(self.failed(cause, self.place(&format!("stepper_{name}"))))
+        })
+    }
+
+    pub(super) fn kinematics(&self) -> Option<&'a str> {
+        self.config().section("printer")?.text("kinematics")
+    }
+
+    /// What klippy says about its toolhead.
+    pub(super) fn toolhead(&mut self) -> Result<Value, Outcome> {
+        match self.host.query(&["toolhead"]) {
+            Ok(mut status) => Ok(status["toolhead"].take()),
+            Err(_) => Err(self.failed("klippy does not answer", None)),
+        }
+    }
+}
+
+/// The ends of the axes' travel, as klippy says them.
+pub(super) fn travel(toolhead: &Value) -> ([f64; 3], [f64; 3]) {
+    (coordinates(&toolhead["axis_minimum"]), coordinates(&toolhead["axis_maximum"]))
+}
+
+/// The first three numbers of a list.
+pub(super) fn coordinates(list: &Value) -> [f64; 3] {
+    [0, 1, 2].map(|n| list[n].as_f64().unwrap_or_default())
+}
