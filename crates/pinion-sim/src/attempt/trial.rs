@@ -23,7 +23,7 @@ use crate::own::serve::{Folder, Own, section_of};
 
 /// How long homing, leveling or a macro may take.
 pub(super) const LONG: Duration = Duration::from_secs(400);
-/// How long it may take until a fan turns or a heater cools.
+/// How long it may take until a fan turns.
 pub(super) const SOON: Duration = Duration::from_secs(30);
 /// How long klippy has to be ready.
 const READY: Duration = Duration::from_secs(90);
@@ -32,8 +32,9 @@ const CLOCKS: Duration = Duration::from_secs(10);
 const CLOCKS_OFF: f64 = 1e-4;
 
 /// Words of a stop because a computer is too busy.
-const BUSY: [&str; 6] = [
+const BUSY: [&str; 7] = [
     "Timer too close",
+    "Stepper too far in past",
     "Rescheduled timer in the past",
     "Missed scheduling of next",
     "Lost communication with MCU",
@@ -103,10 +104,19 @@ impl<'a> Trial<'a> {
         }
     }
 
+    /// Fails with klippy's words if it stopped.
+    pub(super) fn still_ready(&mut self) -> Result<(), Outcome> {
+        match self.host.state() {
+            Ok((state, words)) if state != "ready" => Err(self.failed(words, None)),
+            _ => Ok(()),
+        }
+    }
+
     /// Runs G-code. The error is the outcome.
     pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
         match self.host.gcode(script, limit) {
-            Ok(()) => Ok(()),
+            // M400 ends without an error if klippy stops meanwhile.
+            Ok(()) => self.still_ready(),
             Err(Refused::Error(words)) => {
                 let words = self.why(words);
                 Err(self.failed(format!("{script}: {words}"), None))

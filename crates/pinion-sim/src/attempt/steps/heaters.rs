@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::{Seen, skipped};
 use crate::attempt::host::Host;
 use crate::attempt::report::Outcome;
-use crate::attempt::trial::{LONG, SOON, Trial};
+use crate::attempt::trial::{LONG, Trial};
 
 /// How long a heater may take.
 const HEAT: Duration = Duration::from_secs(240);
@@ -57,11 +57,7 @@ pub(super) fn heated(trial: &mut Trial<'_>) -> Seen {
         };
         let cold = targets.iter().find(|(name, target)| (celsius(&status, name) - target).abs() > NEAR_K);
         let Some((name, target)) = cold else { break };
-        if let Ok((state, words)) = trial.host.state()
-            && state != "ready"
-        {
-            return Err(trial.failed(words, None));
-        }
+        trial.still_ready()?;
         if Instant::now() > until {
             let cause = format!("{name} is at {:.0} of {target} C", celsius(&status, name));
             return Err(trial.failed(cause, trial.place(name)));
@@ -95,7 +91,7 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     };
     let hot = read(&mut trial.host);
     trial.gcode("TURN_OFF_HEATERS", LONG)?;
-    let until = Instant::now() + SOON;
+    let until = Instant::now() + HEAT;
     loop {
         let now = read(&mut trial.host);
         let still = hot.iter().zip(&now).position(|(hot, now)| *hot > 45.0 && hot - now < 2.0);
@@ -109,8 +105,15 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     }
 }
 
+/// Heats a heater, and waits until it has its target.
+pub(super) fn heat(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outcome> {
+    let Some((_, target)) = targets(trial).into_iter().find(|(name, _)| name == heater) else { return Ok(()) };
+    trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={} TARGET={target}", own_name(heater)), LONG)?;
+    until_hot(trial, heater)
+}
+
 /// Waits until a heater has its target.
-pub(super) fn until_hot(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outcome> {
+fn until_hot(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outcome> {
     let until = Instant::now() + HEAT;
     loop {
         let status = trial.host.query(&[heater]).unwrap_or_default();
@@ -119,6 +122,7 @@ pub(super) fn until_hot(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outco
         if (now - target).abs() < NEAR_K {
             return Ok(());
         }
+        trial.still_ready()?;
         if Instant::now() > until {
             return Err(trial.failed(format!("{heater} is at {now:.0} of {target} C"), None));
         }

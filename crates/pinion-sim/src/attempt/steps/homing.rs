@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use super::{Seen, skipped};
+use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial, coordinates, travel};
 
 /// The nozzle's axes, as klippy names them.
@@ -43,6 +44,19 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
     }
     let [x, y, z] = nozzle;
     Ok(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
+}
+
+/// How far klippy's position is from the nozzle's along the axes of which [homing_override] only says where they are: a
+/// belt. `homed` has checked that the others agree.
+pub(super) fn said_mm(trial: &mut Trial<'_>) -> Result<[f64; 3], Outcome> {
+    let Some(over) = trial.config().section("homing_override") else { return Ok([0.0; 3]) };
+    let klippys = coordinates(&trial.toolhead()?["position"]);
+    let nozzle = trial.probe.nozzle_mm();
+    Ok([0, 1, 2].map(|axis| {
+        let is_said = over.text(&format!("set_position_{}", AXES[axis])).is_some();
+        let off = klippys[axis] - nozzle[axis];
+        if is_said && off.abs() > NEAR_MM { off } else { 0.0 }
+    }))
 }
 
 /// Whether klippy's position is the nozzle's: nothing is between them, and the bed does not change it.

@@ -3,7 +3,9 @@
 
 #![forbid(unsafe_code)]
 
+use super::heaters::heat;
 use super::{Seen, skipped};
+use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial};
 
 /// Usual names of theirs.
@@ -23,7 +25,15 @@ pub(super) fn macros(trial: &mut Trial<'_>) -> Seen {
     }
     let before = trial.lost();
     for name in &found {
-        trial.gcode(&format!("{name} {PARAMETERS}"), LONG)?;
+        let script = format!("{name} {PARAMETERS}");
+        match trial.gcode(&script, LONG) {
+            // Some expect that the slicer has heated before.
+            Err(Outcome::Failed { cause, .. }) if cause.contains("Extrude below minimum temp") => {
+                heat(trial, "extruder")?;
+                trial.gcode(&script, LONG)?;
+            }
+            result => result?,
+        }
     }
     trial.lost_none_since(&before)?;
     Ok(found.join(", "))

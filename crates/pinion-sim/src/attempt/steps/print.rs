@@ -10,9 +10,10 @@ use std::time::Duration;
 
 use pinion::cli::files;
 use pinion_firmware::time::{Clock, Ticks};
-use pinion_sim::{AskedPath, Recorder, compare};
+use pinion_sim::{AskedPath, PathPoint, Recorder, compare};
 
-use super::heaters::{targets, until_hot};
+use super::heaters::heat;
+use super::homing::said_mm;
 use super::square::square;
 use super::{Seen, skipped};
 use crate::attempt::host::Refused;
@@ -41,6 +42,7 @@ pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
     let asked = AskedPath::read(BufReader::new(text.as_bytes()), &name);
     let asked = asked.map_err(|trouble| trial.failed(trouble.to_string(), None))?;
     prepare(trial)?;
+    let said = said_mm(trial)?;
     let before = trial.lost();
     let (sent, recorder) = recorded(trial, |trial| {
         let lines: Vec<&str> = text.lines().collect();
@@ -49,7 +51,12 @@ pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
         }
         trial.gcode("M400", PRINT)
     })?;
-    let compared = compare(recorder.points(), &asked);
+    let place = |point: &PathPoint| {
+        let nozzle_mm = [0, 1, 2].map(|axis| point.nozzle_mm[axis] + said[axis]);
+        PathPoint { nozzle_mm, ..*point }
+    };
+    let points: Vec<PathPoint> = recorder.points().iter().map(place).collect();
+    let compared = compare(&points, &asked);
     trial.path = Some(recorder);
     sent?;
     trial.lost_none_since(&before)?;
@@ -76,12 +83,8 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
     if trial.attempt.gcode.is_some() {
         return Ok(());
     }
-    let hot = targets(trial).into_iter().find(|(name, _)| name == "extruder");
     trial.gcode("G28", LONG)?;
-    if let Some((_, target)) = hot {
-        trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER=extruder TARGET={target}"), LONG)?;
-    }
-    until_hot(trial, "extruder")
+    heat(trial, "extruder")
 }
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.
