@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The configuration file of `pinion run`: the options of the command line, by name.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::io;
 use std::ops::Range;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion console`: a host for people, in place of klippy.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::{self, BufRead, BufReader, IsTerminal, Read};
 use std::os::unix::fs::OpenOptionsExt;

@@ -9,8 +9,6 @@
 //! A host or a client can cause some lines as often as it likes. So lines of one kind have a limit. Lines above it are
 //! counted, and one line reports them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program's subcommands.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsString;
 use std::fs::Metadata;
 use std::os::unix::fs::FileTypeExt;

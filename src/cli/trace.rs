@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion trace`: why the MCU stopped and who was late, from a recording of its last seconds.
 
-#![forbid(unsafe_code)]
-
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter};
 use std::path::{Path, PathBuf};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A host with a text interface: lines of commands in, responses out (`pinion console`).
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 

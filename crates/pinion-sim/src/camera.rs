@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --camera`: the simulated printer as a webcam.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};

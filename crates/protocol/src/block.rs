@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Message blocks: length, sequence, payload, CRC, sync (docs/Protocol.md, "Message blocks").
 
-#![forbid(unsafe_code)]
-
 use super::crc::crc16_ccitt;
 
 /// Bytes of an empty block.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer.cfg that matches a simulated printer.
 
-#![forbid(unsafe_code)]
-
 use super::config::SimConfig;
 use super::description::axes::{AxisConfig, DeltaConfig, End};
 use super::description::heater::{FanConfig, HeaterConfig};

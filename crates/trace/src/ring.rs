@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Writing events into a ring, all of them or with a quota.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_sync::ring::{Pen, Ring};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace as text for a person: one line for each thing of note. Between them, one line for all else that a thread did.
 
-#![forbid(unsafe_code)]
-
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::io::{self, Write};

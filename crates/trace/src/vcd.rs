@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace as the signals of a logic analyzer: VCD (IEEE 1364) for PulseView and GTKWave.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The boot loader's settings: which line of config.txt, or which overlay, enables a bus.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 
 use super::catalog::Bus;

@@ -3,8 +3,6 @@
 //!
 //! To add one, write its file and name it in [`DEVICES`] or [`BOARDS`]. The tests check it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Deserialize;

@@ -8,8 +8,6 @@
 //! A change is a splice: the text that it has replaced, and the new text. So it can be taken back after others have
 //! changed the file elsewhere. The record of all splices of a device is written before the first of them is made.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Asks the device, before anything is written to printer.cfg.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 
 use serde_json::json;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion add` without a device: what can be added here.
 
-#![forbid(unsafe_code)]
-
 use serde_json::{Value, json};
 
 use crate::cli::page::aligned;

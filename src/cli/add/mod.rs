@@ -5,8 +5,6 @@
 //! restart, and measures. A call that ends at a reboot or at a wrong wire goes on when it is repeated: each step first
 //! checks if it is done.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::io::{self, BufRead as _, IsTerminal as _};
 use std::path::PathBuf;

@@ -3,8 +3,6 @@
 //!
 //! A request is one connection of HTTP/1.0, so its answer ends with the connection. No library does less than this.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::thread;

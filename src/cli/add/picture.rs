@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The header of a board with the wires to make, in the terminal and as SVG.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::page::{Page, aligned};
 use pinion_linux::foreign::plain_xml;
 

@@ -4,8 +4,6 @@
 //! A device has a file of its own in the folder `pinion` beside printer.cfg, and all of them share one
 //! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::os::unix::fs::MetadataExt;

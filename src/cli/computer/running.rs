@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The processes of the computer: their users, the units that started them, and the Pinions among them.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsString;
 use std::fs;
 use std::os::unix::fs::MetadataExt;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Pins and buses: whether they are there, and whether Pinion may open them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::FileTypeExt;

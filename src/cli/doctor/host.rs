@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host: which klippys there are, and whether Pinion speaks their messages.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The instances of Pinion: the running ones, and those whose units are enabled.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 
 use crate::cli::computer::running::{Running, named_config};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The kernel: whether it is built and set up for real time.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};

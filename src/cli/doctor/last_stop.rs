@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The newest recording: why the MCU stopped, and who was late.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io;
 use std::path::PathBuf;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Outputs after the death of both processes: whether the kernel keeps a level that nobody drives any more.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 
 use crate::cli::computer::Computer;

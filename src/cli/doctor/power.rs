@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The firmware's report about a Raspberry Pi's power and temperature.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 use std::process::Command;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Serial ports for the UARTs of stepper drivers: whether they are there, and who else uses them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 
 use crate::cli::computer::device::Port;

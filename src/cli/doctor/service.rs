@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The service: its configuration, whether it runs and in real time, and the obstacles to it.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::Path;
 

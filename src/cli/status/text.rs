@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The status as a page for people.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::page::{Page, aligned};
 use pinion_runtime::status::form::{
     BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, RecorderStatus, State, Status,

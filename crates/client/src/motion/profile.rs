@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A move of one stepper as runs of steps.
 
-#![forbid(unsafe_code)]
-
 use crate::Error;
 
 /// Highest share by which the interval may shrink within one chord of a ramp. A tenth keeps the chord within half a

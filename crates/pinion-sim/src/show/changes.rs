@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The changes since the last report, for a pipe or a file: a line for each thing, or a block for a picture.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::time::Duration;

@@ -25,8 +25,6 @@
 //!
 //! For tests: with `PINION_TEST_HANG` in the environment SIGUSR2 makes the core hang.
 
-#![forbid(unsafe_code)]
-
 mod message;
 mod outputs;
 mod program;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host's end of the link thread: whether a host is there, the blocks of its input, and the output for it.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::Path;

@@ -4,8 +4,6 @@
 //! A number acknowledges all blocks before it. So a block counts only when all blocks before it are done too. This
 //! matters for blocks that the link answers at once, while the core is still busy with earlier blocks.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 
 /// Highest number of blocks that the link has answered and that do not count yet. klippy sends at most 12 blocks before

@@ -2,8 +2,6 @@
 //! The kernel's accounts of this computer: how long threads waited for a processor, and what else slows the
 //! computer down. Not every computer has all of them.
 
-#![forbid(unsafe_code)]
-
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;

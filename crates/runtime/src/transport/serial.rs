@@ -2,8 +2,6 @@
 //! A serial port: a UART, or the port of a USB gadget (`ttyGS0`). It is unknown whether a host is at the other end, so
 //! it is there as long as it sends.
 
-#![forbid(unsafe_code)]
-
 use std::fs::File;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};

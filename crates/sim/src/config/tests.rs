@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The description: the refused values and their errors, and whether its documentation is complete.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 
 /// The error of the default printer with its first `from` replaced by `to`.

@@ -3,8 +3,6 @@
 //!
 //! Places are the rails' in klippy's order of axes. The sketches are the same as in `klippy/kinematics/*.py`.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::PI;
 
 use crate::description::axes::DeltaConfig;

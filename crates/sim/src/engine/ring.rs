@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A mass that rings on an axis, for parts that feel it, and for people who want to see it.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::TAU;
 use std::sync::Arc;
 

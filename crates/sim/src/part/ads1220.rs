@@ -8,8 +8,6 @@
 //! way round. The chip shifts out the cell's load at the first clock. Not simulated: other inputs (they read 0), the
 //! temperature sensor, the current sources, the filter of 50 and 60 Hz.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

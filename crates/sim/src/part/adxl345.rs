@@ -13,8 +13,6 @@
 //! sleep and self test, the trigger mode (it works like the stream mode) and the interrupt pins (INT_SOURCE has the
 //! same bits).
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::sync::Arc;
 

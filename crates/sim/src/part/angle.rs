@@ -11,8 +11,6 @@
 //! MT6826S's calibration. Not simulated: noise, the sensors' own delays and filters, faults of the magnet, outputs
 //! other than SPI.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 mod a1333;

@@ -6,8 +6,6 @@
 //! bits of brightness, and blue, green, red with 8 bits each. Not simulated: each light passes data on half a clock
 //! later, so a host sends ones at the end. Here the last light gets its color with its last bit.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 

@@ -13,8 +13,6 @@
 //! Simulated: all of this, by the clock. The chip shifts out the cell's load at the first pulse, not at the end of the
 //! conversion before. Channel B is not connected and reads noise. The settling after a change of the gain is omitted.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

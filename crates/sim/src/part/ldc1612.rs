@@ -13,8 +13,6 @@
 //! channel 1 and the sequence of channels, the filter of the input (its register keeps what is written), the time of
 //! the search for the drive current.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

@@ -2,8 +2,6 @@
 //! A switch beside the nozzle that closes when it touches the bed: an inductive probe, a Klicky, a microswitch. It has
 //! no noise and no hysteresis.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A chip that converts by its own clock, and its line, which is low while a conversion waits.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::engine::seqlock::Seqlock;

@@ -5,8 +5,6 @@
 //! turn. A servo without pulses stays where it is. Not simulated: the load, and a refresh rate that is too low or too
 //! high.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 

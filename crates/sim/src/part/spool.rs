@@ -4,8 +4,6 @@
 //! Simulated: a filament that moves with the extruder's axis, forward and backward. It ends after a length. It can be
 //! stuck from a length on, so that the extruder grinds it. A pin stands for the person who inserts a new spool.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 

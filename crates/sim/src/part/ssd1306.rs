@@ -10,8 +10,6 @@
 //! line, the status byte. Not simulated: scrolling, contrast, oscillator and voltages, other wirings of the COM
 //! outputs. The memory starts as noise, as in a real chip.
 
-#![forbid(unsafe_code)]
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 

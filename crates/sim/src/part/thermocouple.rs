@@ -7,8 +7,6 @@
 //! resistor follows the equation of Callendar and Van Dusen (IEC 60751). Not simulated: noise, averaging, the cold
 //! junction's limits and offset, the MAX31865's fault detection cycle.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

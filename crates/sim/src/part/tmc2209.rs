@@ -11,8 +11,6 @@
 //! with a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep, temperatures and faults, the automatic tuning of
 //! StealthChop, the pulse generator (VACTUAL), INDEX, and the effects of the OTP memory.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};

@@ -14,8 +14,6 @@
 //! Not simulated: CoolStep, temperatures and faults, the automatic tuning of StealthChop, and the ramp generator
 //! and encoder (their registers keep what is written).
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

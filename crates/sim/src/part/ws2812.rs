@@ -9,8 +9,6 @@
 //! A pulse outside the data sheet's tolerance counts as the nearer value. The display of the colors mentions these
 //! pulses, because real strips differ in how they read them.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The path that a G-code file asks for, read as klippy reads it.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::TAU;
 use std::io::{BufRead, Read};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A verdict for each cause, over made-up recordings.
 
-#![forbid(unsafe_code)]
-
 use std::ops::Range;
 
 use pinion_firmware::time::Clock;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Homing, and the second carriage of a printer with two.
 
-#![forbid(unsafe_code)]
-
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, Trial, coordinates, travel};
 

@@ -4,8 +4,6 @@
 //! A step is one command or a few, and looks at the printer, not only at klippy: where the motors put the nozzle, how
 //! hot the heater is, how fast the fan turns.
 
-#![forbid(unsafe_code)]
-
 mod heaters;
 mod homing;
 mod leveling;

@@ -2,8 +2,6 @@
 //! Facts about a Klipper host, found from outside: its process, the messages that its sources look up, and so the
 //! dialect that it speaks.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};

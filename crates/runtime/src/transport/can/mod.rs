@@ -2,8 +2,6 @@
 //! A CAN bus, by the protocol of Klipper's own firmware. The frames of a host carry the bytes of its blocks, eight in
 //! each, and so do ours. `node.rs` has the protocol, and this file the socket.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Printers with several boards, and every kinematics, by the pins of their motors.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::board::SimWorld;
 use crate::engine::bed::BedShape;

@@ -6,8 +6,6 @@
 //! that drives against the end of its axis has a load that grows with each lost step. It reaches the full torque after
 //! a full step. So the measured value follows each step. In the real chips it follows each full step only.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
