@@ -214,16 +214,6 @@ fn corexy_needs_three_homed_axes() {
 }
 
 #[test]
-fn the_place_of_an_axis_follows_from_the_nozzles() {
-    let config = SimConfig::parse(&example("A delta printer"), "delta").unwrap();
-    let flat_mm = (215.0f64.powi(2) - 105.0f64.powi(2)).sqrt();
-    assert!((config.axis_place("b", [0.0, 0.0, 10.0]).unwrap() - flat_mm - 10.0).abs() < 1e-9);
-    assert_eq!(config.axis_place("b", [500.0, 0.0, 0.0]), None);
-    assert_eq!(config.axis_place("extruder", [0.0; 3]), None);
-    assert_eq!(SimConfig::default_printer().axis_place("y", [1.0, 2.0, 3.0]), Some(2.0));
-}
-
-#[test]
 fn an_empty_description_is_a_board_without_pins() {
     let config = SimConfig::parse("", "empty.toml");
     assert!(config.is_ok_and(|config| config.axes.is_empty()));
