@@ -4,9 +4,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::catalog::{Boot, Bus, Device, Kind, KnownBoard};
-use super::change::{Change, Record, Splice};
+use super::board::{Boot, Bus, KnownBoard};
+use super::catalog::{Device, Kind};
+use super::change::{Change, Record};
 use super::printer::Printer;
+use super::splice::Splice;
 use super::{BUS, Work, boot, system};
 
 /// The file that loads the driver of /dev/i2c-*.

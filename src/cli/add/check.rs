@@ -9,7 +9,8 @@ use crate::cli::computer::{Access, Computer};
 use crate::cli::quietly;
 
 use super::Work;
-use super::catalog::{Check, KnownBoard, Spot};
+use super::board::{KnownBoard, Spot};
+use super::catalog::Check;
 use super::printer::Printer;
 use super::probe::{self, Answer};
 

@@ -5,7 +5,8 @@ use serde_json::{Value, json};
 
 use crate::cli::page::aligned;
 
-use super::catalog::{Catalog, Device, KnownBoard};
+use super::board::KnownBoard;
+use super::catalog::{Catalog, Device};
 use super::report::Report;
 
 /// Lists the devices.

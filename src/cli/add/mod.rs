@@ -20,6 +20,7 @@ use super::files::Output;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::process::Process;
 
+mod board;
 mod boot;
 mod bus;
 mod catalog;
@@ -33,10 +34,13 @@ mod picture;
 mod printer;
 mod probe;
 mod report;
+mod rights;
+mod splice;
 mod undo;
 
+use board::{KnownBoard, Spot, Wire};
 use bus::State;
-use catalog::{Catalog, Device, Kind, KnownBoard, Spot, Way, Wire};
+use catalog::{Catalog, Device, Kind, Way};
 use change::{Change, Record, Side, copy_of};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};

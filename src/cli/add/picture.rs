@@ -4,7 +4,7 @@
 use crate::cli::page::{Page, aligned};
 use pinion_linux::foreign::plain_xml;
 
-use super::catalog::{KnownBoard, Wire};
+use super::board::{KnownBoard, Wire};
 
 /// A table of the wires, and the header with them.
 pub(super) fn page(board: &KnownBoard, wires: &[Wire]) -> Page {

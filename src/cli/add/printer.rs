@@ -19,7 +19,8 @@ use pinion_linux::foreign::word;
 use pinion_runtime::klippy::HOST_PATHS;
 
 use super::catalog::{Device, Kind};
-use super::change::{Change, Side, Splice};
+use super::change::{Change, Side};
+use super::splice::Splice;
 
 /// Where klippy's configuration is if no klippy runs or is set up.
 const USUAL: [&str; 3] =
