@@ -131,8 +131,8 @@ fn row(path: &Path) -> Vec<String> {
         Ok(trace) => [utc_text(trace.head.utc_ms), verdict(&trace).text],
         Err(error) => ["cannot be read".to_owned(), error.to_string()],
     };
-    let [at, told] = cells.map(|cell| foreign::plain(&cell).into_owned());
-    vec![at, foreign::plain(&path.to_string_lossy()).into_owned(), told]
+    let [at, about] = cells.map(|cell| foreign::plain(&cell).into_owned());
+    vec![at, foreign::plain(&path.to_string_lossy()).into_owned(), about]
 }
 
 /// The kept traces, the newest first.

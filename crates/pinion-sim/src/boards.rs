@@ -75,10 +75,10 @@ impl Others {
             let name = format!("board {}", board.name());
             let serve = move || {
                 let timing = board.timing();
-                let told = || {
+                let served = || {
                     ready.fetch_add(1, Ordering::SeqCst);
                 };
-                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, told);
+                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, served);
                 if let Err(trouble) = &ended {
                     log::error!("{trouble}");
                 }

@@ -132,7 +132,8 @@ fn includes_find_files_as_pythons_glob_does() {
     assert!(config.section("hidden").is_none() && config.section("deep").is_some());
     assert_eq!(config.paths().count(), 4);
     std::os::unix::fs::symlink("nowhere", path("link.cfg")).unwrap();
-    for (name, line) in [("link.cfg", "link.cfg: Unable to open config file: "), ("no.cfg", "no.cfg' does not exist: ")] {
+    for (name, line) in [("link.cfg", "link.cfg: Unable to open config file: "), ("no.cfg", "no.cfg' does not exist: ")]
+    {
         fs::write(path("printer.cfg"), format!("[a]\n[include {name}]\n")).unwrap();
         let refusal = Config::read(&path("printer.cfg")).unwrap_err().to_string();
         assert!(refusal.contains("printer.cfg:2: ") && refusal.contains(line), "{refusal}");
@@ -200,7 +201,7 @@ fn constants_of_kalico_are_put_in() {
 }
 
 #[test]
-fn a_copy_differs_only_where_it_is_told_and_stays_in_its_folder() {
+fn a_copy_differs_only_where_asked_and_stays_in_its_folder() {
     let root = tempfile::tempdir().unwrap();
     let home = root.path().join("home");
     fs::create_dir_all(home.join("sub")).unwrap();

@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_that_came_before_is_told_from_one_behind_garbage() {
+    fn a_block_that_came_before_is_distinguished_from_one_behind_garbage() {
         let mut receiver = Receiver::default();
         let mut refused = |bytes: &[u8]| match receiver.next(bytes) {
             (_, Received::Nak(why)) => Some(why),

@@ -24,7 +24,7 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.comment("");
     cfg.comment("Any section but [mcu], [printer] and the steppers may be taken out, with those that say that");
     cfg.comment(
-        "they need it. Sections with a # before each line are offered: the words before tell what they replace.",
+        "they need it. Sections with a # before each line are offered: the words before say what they replace.",
     );
     cfg.section("mcu");
     cfg.key("serial", pty);

@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_last_part_is_told() {
+    fn only_the_last_part_is_reported() {
         let text = text(|out| write(&late_host(), Duration::from_millis(20), out));
         assert_eq!(text.lines().nth(1).map(|line| &line[..6]), Some("-20.00"));
         assert!(text.contains("the MCU stopped in block 93"), "{text}");

@@ -238,7 +238,9 @@ impl Files for Computer {
     fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
         let mut found = Computer::matching(self, pattern);
         // A file in a folder that this user may not search may be there.
-        found.retain(|file| !matches!(fs::symlink_metadata(file), Err(error) if error.kind() == io::ErrorKind::NotFound));
+        found.retain(
+            |file| !matches!(fs::symlink_metadata(file), Err(error) if error.kind() == io::ErrorKind::NotFound),
+        );
         Ok(found.iter().map(|file| self.name(file)).collect())
     }
 

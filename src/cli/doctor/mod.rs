@@ -157,7 +157,7 @@ mod tests {
 
     /// Asserts that a check has found something with these words, and returns the remedy.
     #[track_caller]
-    pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
+    pub(super) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
             finding.check == check && finding.status == status && finding.trouble.found().contains(words)
         };

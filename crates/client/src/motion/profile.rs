@@ -140,7 +140,7 @@ mod tests {
 
     const FREQUENCY_HZ: f64 = 50e6;
 
-    /// The clocks of all steps, calculated with integers only, as in the firmware.
+    /// The clocks of all steps, calculated with integers only, as in an MCU.
     fn step_clocks(profile: &Profile) -> Vec<u64> {
         let (mut clock, mut clocks) = (0u64, Vec::new());
         for run in &profile.runs {

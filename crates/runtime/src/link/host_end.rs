@@ -98,7 +98,7 @@ impl HostEnd {
     }
 
     /// Whether the link's descriptor would report room for bytes.
-    pub(crate) fn tells_of_room(&self) -> bool {
+    pub(crate) fn reports_room(&self) -> bool {
         self.link.due().is_none()
     }
 

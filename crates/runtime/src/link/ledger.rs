@@ -142,7 +142,7 @@ mod tests {
         Respond,
         /// The core is done with its block.
         Finish,
-        /// The link looks how far the core is.
+        /// The link reads how far the core is.
         Look,
         /// The link frames the core's responses, and acknowledges the finished blocks that it saw.
         GiveOut,

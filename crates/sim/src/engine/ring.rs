@@ -121,7 +121,7 @@ pub struct RingWatch {
 }
 
 impl RingWatch {
-    /// Time between two looks. A head that rings with 200 Hz is looked at ten times in a period.
+    /// Time between two samples. A head that rings with 200 Hz is sampled ten times in a period.
     const EACH: Ticks = Ticks::from_us(500);
     /// The axis stands if its last step was this long ago. It accelerates no longer, so the head only rings.
     const STANDS: Ticks = Ticks::from_ms(3);

@@ -96,7 +96,7 @@ mod tests {
     use pinion_firmware::board::PWM_MAX;
 
     #[test]
-    fn a_channel_shows_the_percent_that_klippy_was_told() {
+    fn a_channel_shows_the_percent_that_klippy_set() {
         let channel = PwmChannel { name: "laser".into(), share: AtomicU64::new(0) };
         for percent in 0..=100 {
             // The value that klippy computes (klippy/mcu.py).

@@ -325,8 +325,8 @@ mod tests {
             bench.pulses(std::iter::repeat_n(pulse, 24));
             bench.wait_us(1000);
             let light = if one { "#ffffff" } else { "off" };
-            let told = format!(" ({odd} pulses are not the data sheet's)");
-            assert_eq!(bench.look(), format!("{light}{}", if odd > 0 { &told } else { "" }), "{pulse:?}");
+            let odd_pulses = format!(" ({odd} pulses are not the data sheet's)");
+            assert_eq!(bench.look(), format!("{light}{}", if odd > 0 { &odd_pulses } else { "" }), "{pulse:?}");
         }
     }
 
