@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# `make` alone tells what there is.
+# `make` alone lists the commands.
 
 # Looked for at each use: scripts/system-packages may have installed it just now.
 CARGO ?= $(shell command -v cargo || echo "$$HOME/.cargo/bin/cargo")

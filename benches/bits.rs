@@ -12,9 +12,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use pinion_firmware::board::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
-};
+use pinion_firmware::board::{ClaimedLine, Direction, Line, Pin};
 use pinion_firmware::lateness::Lateness;
 use pinion_firmware::mcu::{Devices, Dialect, DialectName, Finished, Mcu, Note, Outbox, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::Shutdown;
@@ -24,7 +22,7 @@ use pinion_protocol::vlq::{Reader, Writer};
 use pinion_runtime::FIRMWARE;
 use pinion_runtime::realtime::{self, Processors, Role};
 use pinion_runtime::wakeup::{MarginLimits, Waiter};
-use pinion_testbench::board::{Bench, FakeBoard};
+use pinion_testbench::board::{Bench, FakeBoard, PlainBoard};
 
 /// 40 kbaud.
 const BIT: Ticks = Ticks::from_us(25);
@@ -211,53 +209,6 @@ const LEDS: Pin = Pin(9);
 const DOUT: Pin = Pin(10);
 const SCLK: Pin = Pin(11);
 
-/// The bench's board. Each of its lines is the wire, except that of the LEDs.
-struct Wires {
-    rest: FakeBoard,
-    clock: Arc<dyn TimeSource>,
-    edges: Arc<Mutex<Vec<(Clock, bool)>>>,
-    leds: Arc<AtomicU32>,
-    cell: Arc<LoadCell>,
-}
-
-impl Board for Wires {
-    fn describe(&self) -> String {
-        self.rest.describe()
-    }
-    fn pins(&self) -> Vec<Range> {
-        self.rest.pins()
-    }
-    fn spi_buses(&self) -> Vec<Range> {
-        self.rest.spi_buses()
-    }
-    fn line(&mut self, pin: Pin, _: Direction) -> Result<ClaimedLine, Shutdown> {
-        let line: Arc<dyn Line> = match pin {
-            LEDS => Arc::new(Fast(self.leds.clone())),
-            DOUT | SCLK => Arc::new(CellLine { cell: self.cell.clone(), is_clock: pin == SCLK }),
-            _ => Arc::new(Wire { clock: self.clock.clone(), edges: self.edges.clone() }),
-        };
-        Ok(ClaimedLine { line, sleeps_on: None })
-    }
-    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
-        self.rest.adc(pin)
-    }
-    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.rest.spi(config)
-    }
-    fn i2c_buses(&self) -> Vec<Range> {
-        self.rest.i2c_buses()
-    }
-    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.rest.i2c(config)
-    }
-    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
-        self.rest.pwm(config)
-    }
-    fn reset(&mut self) {
-        self.rest.reset();
-    }
-}
-
 /// Workers, with the priority of Pinion's workers.
 struct Threads {
     clock: Arc<dyn TimeSource>,
@@ -408,13 +359,16 @@ impl Printer {
         let bench = Bench::new(pinion_firmware::time::VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
         let leds = Arc::new(AtomicU32::new(0));
         let cell = Arc::new(LoadCell::default());
-        let board = Wires {
-            rest: FakeBoard(bench),
-            clock: clock.clone(),
-            edges: edges.clone(),
-            leds: leds.clone(),
-            cell: cell.clone(),
-        };
+        // Each line is the wire, except those of the LEDs and of the load cell.
+        let (wire_edges, wire_clock, led_line, cell_line) = (edges.clone(), clock.clone(), leds.clone(), cell.clone());
+        let board = PlainBoard(FakeBoard(bench), move |_: &mut FakeBoard, pin, _| {
+            let line: Arc<dyn Line> = match pin {
+                LEDS => Arc::new(Fast(led_line.clone())),
+                DOUT | SCLK => Arc::new(CellLine { cell: cell_line.clone(), is_clock: pin == SCLK }),
+                _ => Arc::new(Wire { clock: wire_clock.clone(), edges: wire_edges.clone() }),
+            };
+            Ok(ClaimedLine { line, sleeps_on: None })
+        });
         let dialect = Dialect::new(&FIRMWARE, &board, DialectName::Master);
         let dialect = Arc::new(dialect.expect("a dialect"));
         let id = |format: &str| dialect.dictionary().responses[format].as_i64().unwrap_or(0) as u32;
@@ -434,27 +388,19 @@ impl Printer {
         printer.run("finalize_config crc=%u", &[1], None);
         let (first, rest) = COLORS.split_at(COLORS.len() / 2);
         for (pos, data) in [(0, first), (first.len(), rest)] {
-            printer.update(pos as u32, data);
+            printer.run("neopixel_update oid=%c pos=%hu data=%*s", &[1, pos as u32], Some((data, &[])));
         }
         printer
     }
 
-    fn update(&mut self, pos: u32, data: &[u8]) {
-        let mut command = Writer::default();
-        command.int(self.dialect.command_id("neopixel_update oid=%c pos=%hu data=%*s").expect("a command"));
-        command.int(1);
-        command.int(pos);
-        command.string(data);
-        self.mcu.execute(&mut Reader::new(command.payload().expect("it fits")));
-    }
-
-    fn run(&mut self, format: &str, before: &[u32], bytes: Option<(&[u8], u32)>) {
+    /// Runs a command with these numbers, bytes, and numbers behind the bytes.
+    fn run(&mut self, format: &str, before: &[u32], bytes: Option<(&[u8], &[u32])>) {
         let mut command = Writer::default();
         command.int(self.dialect.command_id(format).expect("a command"));
         before.iter().for_each(|int| command.int(*int));
         if let Some((bytes, behind)) = bytes {
             command.string(bytes);
-            command.int(behind);
+            behind.iter().for_each(|int| command.int(*int));
         }
         self.mcu.execute(&mut Reader::new(command.payload().expect("it fits")));
     }
@@ -462,7 +408,7 @@ impl Printer {
     /// Sends a message, and reads a reply of this length. Returns the edges, and the reply: whole, none or wrong.
     fn exchange(&mut self, message: &[u8], read: usize) -> (Vec<(Clock, bool)>, Reply) {
         self.edges.lock().unwrap().clear();
-        self.run("tmcuart_send oid=%c write=%*s read=%c", &[0], Some((message, read as u32)));
+        self.run("tmcuart_send oid=%c write=%*s read=%c", &[0], Some((message, &[read as u32])));
         let response = self.response();
         let reply = match (response.ends_with(&REPLY), response.ends_with(&[0])) {
             (true, _) => Reply::Whole,

@@ -7,17 +7,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use pinion_firmware::board::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
-};
+use pinion_firmware::board::{Board, ClaimedLine, Direction, Line};
 use pinion_firmware::mcu::{Dialect, DialectName, MOVE_COUNT, Snapshot};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_protocol::block::PAYLOAD_MAX;
-use pinion_testbench::board::{Bench, FakeBoard};
+use pinion_testbench::board::{Bench, FakeBoard, PlainBoard};
 use pinion_testbench::rig::{FIRMWARE, Rig};
-
-/// The bench's board with outputs that do nothing, so that only the MCU's cost is left.
-struct Quiet(FakeBoard);
 
 struct QuietLine;
 
@@ -34,41 +29,11 @@ impl Line for QuietLine {
     }
 }
 
-impl Board for Quiet {
-    fn describe(&self) -> String {
-        self.0.describe()
-    }
-    fn pins(&self) -> Vec<Range> {
-        self.0.pins()
-    }
-    fn spi_buses(&self) -> Vec<Range> {
-        self.0.spi_buses()
-    }
-    fn line(&mut self, _: Pin, _: Direction) -> Result<ClaimedLine, Shutdown> {
+/// The bench's board with outputs that do nothing, so that only the MCU's cost is left.
+fn quiet(bench: Bench) -> impl Board {
+    PlainBoard(FakeBoard(bench), |_: &mut FakeBoard, _, _| {
         Ok(ClaimedLine { line: Arc::new(QuietLine), sleeps_on: None })
-    }
-    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
-        self.0.adc(pin)
-    }
-    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.0.spi(config)
-    }
-    fn i2c_buses(&self) -> Vec<Range> {
-        self.0.i2c_buses()
-    }
-    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.0.i2c(config)
-    }
-    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
-        self.0.pwm(config)
-    }
-    fn reset(&mut self) {
-        self.0.reset();
-    }
-}
-
-fn quiet(bench: Bench) -> Quiet {
-    Quiet(FakeBoard(bench))
+    })
 }
 
 /// `steppers` steppers whose moves are queued by the caller.
@@ -167,7 +132,7 @@ fn steps(c: &mut Criterion) {
     group.finish();
 }
 
-/// The core's cost of telling its status: a whole snapshot, and the share of their time that steps lose by a hundred
+/// The core's cost of reporting its status: a whole snapshot, and the share of their time that steps lose by a hundred
 /// snapshots a second. The two are measured in turns, so that their ratio also holds on a busy computer.
 fn status(c: &mut Criterion) {
     let mut rig = rig_of(8, -1);

@@ -2,8 +2,6 @@
 //! `pinion run --check`: whether a configuration can be served on this computer. Nothing is changed: no link is made
 //! and no output is touched. The hardware watchdog is not opened, because opening it would start it.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
@@ -288,16 +286,16 @@ mod tests {
 
     #[test]
     fn a_wire_that_is_not_there_yet_is_a_warning() {
-        let told = |link: &str| wire(&link.parse().unwrap());
-        let port = told("serial:/dev/none");
+        let finding = |link: &str| wire(&link.parse().unwrap());
+        let port = finding("serial:/dev/none");
         assert!(port.status == Level::Warning && port.trouble.cause.contains("there is no /dev/none"), "{port:?}");
-        let bus = told("can:none,0123456789ab");
+        let bus = finding("can:none,0123456789ab");
         match can_open("none") {
             Ok(()) => assert!(bus.trouble.cause.contains("there is no CAN interface none"), "{bus:?}"),
             // This kernel has no CAN.
             Err(trouble) => assert_eq!((bus.status, bus.trouble), (Level::Error, trouble)),
         }
-        assert_eq!(told("stdio").status, Level::Ok);
+        assert_eq!(finding("stdio").status, Level::Ok);
     }
 
     #[test]

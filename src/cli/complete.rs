@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The names that a shell offers for the value of an option. The option may take other values too.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsStr;
 use std::fmt::Display;
 use std::str::FromStr;

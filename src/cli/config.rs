@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The configuration file of `pinion run`: the options of the command line, by name.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::io;
 use std::ops::Range;
@@ -250,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_its_place() {
+    fn a_wrong_value_is_reported_with_its_place() {
         assert_eq!(error("realtme = true"), "f.toml:1:1: realtme: there is no such key: did you mean realtime?");
         assert_eq!(
             error("cpu = 1\n\n  Margin = 3"),
@@ -283,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_toml_is_told_with_its_place() {
+    fn text_that_is_no_toml_is_reported_with_its_place() {
         for (text, place) in [("cpu = ", "1:7: "), ("cpu = 3\ncpu = 4", "2:1: "), ("\nrealtime true", "2:10: ")] {
             let error = error(text);
             assert!(error.starts_with(&format!("f.toml:{place}")) && !error.contains('\n'), "{text}: {error}");
@@ -291,14 +289,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_toml_is_told_with_the_way_to_write_it() {
-        for (text, told) in [
+    fn text_that_is_no_toml_is_reported_with_the_way_to_write_it() {
+        for (text, refusal) in [
             ("mode = 0660", "1:8: mode: write it such as mode = \"0660\""),
             ("mode = 0o660", "1:8: mode: write it such as mode = \"0660\""),
             ("cpu = 3\nmode=0660 # octal", "2:6: mode: write it such as mode = \"0660\""),
             ("symlink = /tmp/x", "1:11: symlink: write it such as symlink = \"/tmp/klipper_host_mcu\""),
         ] {
-            assert_eq!(error(text), format!("f.toml:{told}"));
+            assert_eq!(error(text), format!("f.toml:{refusal}"));
         }
         assert_eq!(parse("mode = \"0640\"", &"").unwrap().mode, Some(0o640));
     }

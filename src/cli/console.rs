@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion console`: a host for people, in place of klippy.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::{self, BufRead, BufReader, IsTerminal, Read};
 use std::os::unix::fs::OpenOptionsExt;
@@ -241,11 +239,11 @@ fn script(mut console: Console, mut lines: impl BufRead) -> Result<(), String> {
             Ok(_) => {}
             Err(error) => return Err(format!("line {number} cannot be read: {error}")),
         }
-        let told = &mut |line: &str| drop(print(&one(line)));
+        let show = &mut |line: &str| drop(print(&one(line)));
         if !line.trim().is_empty() {
-            told(&format!("{PROMPT}{}", line.trim()));
+            show(&format!("{PROMPT}{}", line.trim()));
         }
-        match console.line(line.trim_end_matches(['\r', '\n']), told) {
+        match console.line(line.trim_end_matches(['\r', '\n']), show) {
             Ok(Next::Line) => {}
             Ok(Next::End) => break,
             Err(error) => return Err(format!("line {number}: {error}")),
@@ -335,12 +333,12 @@ fn attend(
     answers: &Sender<Option<Vocabulary>>,
     gone: &AtomicBool,
 ) {
-    let mut told = |line: &str| drop(printer.print(one(line).to_string()));
+    let mut show = |line: &str| drop(printer.print(one(line).to_string()));
     loop {
         match lines.recv_timeout(Duration::ZERO) {
             Ok(line) => {
-                let next = console.line(&line, &mut told).unwrap_or_else(|error| {
-                    told(&format!("!! {error}"));
+                let next = console.line(&line, &mut show).unwrap_or_else(|error| {
+                    show(&format!("!! {error}"));
                     Next::Line
                 });
                 let answer = (next == Next::Line).then(|| console.vocabulary().clone());
@@ -349,8 +347,8 @@ fn attend(
                 }
             }
             Err(RecvTimeoutError::Timeout) => {
-                if let Err(error) = console.listen(LOOK, &mut told) {
-                    told(&format!("!! {error}"));
+                if let Err(error) = console.listen(LOOK, &mut show) {
+                    show(&format!("!! {error}"));
                     if console.is_gone() {
                         gone.store(true, Ordering::Relaxed);
                         return;

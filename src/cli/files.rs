@@ -4,8 +4,6 @@
 //! The files may come from anybody. Only regular files are opened, so no FIFO blocks and no device notices. An output
 //! replaces the file at its place when it is whole: a command that fails leaves the old file, or none.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::fs::{self, File, Metadata, OpenOptions, Permissions};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The report of `pinion doctor` and `pinion run --check`: findings, each with its level and its remedy.
 
-#![forbid(unsafe_code)]
-
 use std::process::ExitCode;
 
 use serde::{Serialize, Serializer};

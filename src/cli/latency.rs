@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion latency`: how late this computer wakes up, and for which outputs that is good enough.
 
-#![forbid(unsafe_code)]
-
 use std::env;
 use std::fmt::Write as _;
 use std::fs;

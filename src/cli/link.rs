@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion link`: a pty for an MCU on another computer, over ssh.
 
-#![forbid(unsafe_code)]
-
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;

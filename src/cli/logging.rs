@@ -9,8 +9,6 @@
 //! A host or a client can cause some lines as often as it likes. So lines of one kind have a limit. Lines above it are
 //! counted, and one line reports them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
@@ -311,13 +309,13 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn what_does_not_fit_is_counted_and_told_of_after_what_did() {
+    fn lines_that_do_not_fit_are_counted_and_reported_after_the_others() {
         let mut queue = Queue::new();
         (0..LINES_MAX + 3).for_each(|n| queue.push(n.to_string()));
         let lines: Vec<String> = std::iter::from_fn(|| queue.pop(Style::Plain)).collect();
-        let (told, kept) = lines.split_last().unwrap();
+        let (loss, kept) = lines.split_last().unwrap();
         assert_eq!(kept, (0..LINES_MAX).map(|n| n.to_string()).collect::<Vec<_>>());
-        assert!(told.ends_with("WARN  3 lines of the log were lost, as nobody read it\n"), "{told}");
+        assert!(loss.ends_with("WARN  3 lines of the log were lost, as nobody read it\n"), "{loss}");
         assert!(queue.is_done());
     }
 

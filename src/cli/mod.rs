@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program's subcommands.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsString;
 use std::fs::Metadata;
 use std::os::unix::fs::FileTypeExt;
@@ -254,8 +252,8 @@ mod tests {
         let link = folder.path().join("link");
         std::os::unix::fs::symlink(&socket, &link).unwrap();
         for other in [&file, &link] {
-            let told = not_permitted(Path::new("/tmp/klipper_host_mcu"), other);
-            assert!(told.ends_with("may not be opened by this user: name the link of a Pinion"), "{told}");
+            let refusal = not_permitted(Path::new("/tmp/klipper_host_mcu"), other);
+            assert!(refusal.ends_with("may not be opened by this user: name the link of a Pinion"), "{refusal}");
         }
         assert!(not_permitted(&socket, &socket).contains("use sudo"));
     }

@@ -4,8 +4,6 @@
 //! The text of a line may come from anywhere: a host, a process, a file, a device. In a [`Page`] it stays in its line,
 //! and has nothing that a terminal takes for a command. The log does the same (`logging.rs`).
 
-#![forbid(unsafe_code)]
-
 use std::fmt::{self, Display, Write as _};
 use std::fs::File;
 use std::io::{self, Write as _};

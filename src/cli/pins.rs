@@ -3,8 +3,6 @@
 //!
 //! The list is gathered first, then written as a table or as JSON.
 
-#![forbid(unsafe_code)]
-
 mod gather;
 mod text;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The settings of `pinion run`: from its command line, its configuration file and the defaults.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion status`: asks a running Pinion for its status.
 
-#![forbid(unsafe_code)]
-
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -135,7 +133,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_an_instance_tells_stays_in_its_line(name in any_name()) {
+        fn any_words_of_an_instance_stay_in_its_line(name in any_name()) {
             let called = |name: &str| {
                 let mut document = json!(stopped());
                 rename(&mut document, name);

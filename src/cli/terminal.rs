@@ -5,8 +5,6 @@
 //! are remembered here. They are undone when they are dropped, when the program panics, and when a signal ends it. The
 //! escape sequences and the names of keys are termina's.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Display;
 use std::io::{self, IsTerminal};
 use std::os::fd::AsFd;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion trace`: why the MCU stopped and who was late, from a recording of its last seconds.
 
-#![forbid(unsafe_code)]
-
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter};
 use std::path::{Path, PathBuf};
@@ -133,8 +131,8 @@ fn row(path: &Path) -> Vec<String> {
         Ok(trace) => [utc_text(trace.head.utc_ms), verdict(&trace).text],
         Err(error) => ["cannot be read".to_owned(), error.to_string()],
     };
-    let [at, told] = cells.map(|cell| foreign::plain(&cell).into_owned());
-    vec![at, foreign::plain(&path.to_string_lossy()).into_owned(), told]
+    let [at, about] = cells.map(|cell| foreign::plain(&cell).into_owned());
+    vec![at, foreign::plain(&path.to_string_lossy()).into_owned(), about]
 }
 
 /// The kept traces, the newest first.

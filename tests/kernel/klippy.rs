@@ -33,7 +33,7 @@ for module in list(sys.modules.values()):
             print(file)
 "#;
 
-/// The path of the file that tells the tests where klippy is: Python, its search path and klippy's folder.
+/// The path of the file that says where klippy is: Python, its search path and klippy's folder.
 const PLACES: &str = "/tests/klippy";
 
 /// klippy, Python and its modules. Their paths are the same in the guest.

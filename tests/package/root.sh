@@ -33,7 +33,7 @@ mmdebstrap --quiet --mode=root --variant=minbase \
 echo 'deb [trusted=yes] file:/opt/packages ./' >root/etc/apt/sources.list
 # apt would look for questions in each package, with Perl. No package here has any.
 rm root/etc/apt/apt.conf.d/70debconf
-# klippy's user, who is in the group that the README tells, and somebody else.
+# klippy's user, who is in the group that the README names, and somebody else.
 in_root useradd -m -s /bin/bash -G tty klippy
 in_root useradd -m -s /bin/bash stranger
 echo guest >root/etc/hostname

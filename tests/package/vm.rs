@@ -127,7 +127,7 @@ impl Vm {
         let (output, status) = loop {
             if let Some(answer) = self.line()?.strip_prefix('=') {
                 let (output, status) = answer.rsplit_once(' ').unwrap_or((answer, ""));
-                let status: i32 = status.parse().map_err(|_| self.failed("the agent told no status"))?;
+                let status: i32 = status.parse().map_err(|_| self.failed("the agent sent no status"))?;
                 break (from_base64(output), status);
             }
         };

@@ -255,9 +255,9 @@ fn each_board_gets_its_own_line_and_back() {
         );
         assert_eq!(card.read(&format!("{PRINTER}.before-add-adxl345")), PRINTER_CFG);
         let once = card.snapshot();
-        let told = card.added(&["adxl345", "--yes"]);
+        let printed = card.added(&["adxl345", "--yes"]);
         assert_eq!(card.snapshot(), once, "{model}: twice");
-        assert!(told.contains("Nothing is left to change."), "{told}");
+        assert!(printed.contains("Nothing is left to change."), "{printed}");
         card.added(&["adxl345", "--undo", "--yes"]);
         assert_eq!(card.snapshot(), before, "{model}: --undo");
     }
@@ -301,8 +301,8 @@ fn a_chip_with_two_buses_takes_the_free_one() {
     let card = Card::pi();
     card.added(&["adxl345", "--yes"]);
     card.added(&["lis3dh", "--yes"]);
-    let told = card.added(&["lis2dw", "--yes"]);
-    assert!(told.contains("whose pins it would need: so it is connected by I2C."), "{told}");
+    let printed = card.added(&["lis2dw", "--yes"]);
+    assert!(printed.contains("whose pins it would need: so it is connected by I2C."), "{printed}");
     let file = PRINTER.replace("printer.cfg", "pinion/lis2dw.cfg");
     assert!(card.read(&file).contains("\ni2c_bus: i2c.1\n"), "{}", card.read(&file));
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=i2c_arm=on\n"));
@@ -310,8 +310,8 @@ fn a_chip_with_two_buses_takes_the_free_one() {
     // The other place is free again, and the wires are made already.
     card.added(&["lis3dh", "--undo", "--yes"]);
     let before = card.snapshot();
-    let told = card.added(&["lis2dw", "--yes"]);
-    assert!(told.contains("by I2C\n") && told.contains("Nothing is left to change."), "{told}");
+    let printed = card.added(&["lis2dw", "--yes"]);
+    assert!(printed.contains("by I2C\n") && printed.contains("Nothing is left to change."), "{printed}");
     assert_eq!(card.snapshot(), before);
 }
 
@@ -365,7 +365,7 @@ fn a_picture_of_the_wires() {
 }
 
 #[test]
-fn an_unknown_board_is_told_what_to_look_up() {
+fn the_user_of_an_unknown_board_reads_what_to_look_up() {
     for model in ["Pine64+", "", "\u{1b}[2J\u{202e}Raspberry\nPi 4", &"x".repeat(100_000)] {
         let card = Card::of(model, &[]);
         let before = card.snapshot();
@@ -472,7 +472,7 @@ fn the_wires_are_those_of_the_board_s_settings() {
     assert!(shown.contains("\n+ dtoverlay=pwm-2chan\n") && shown.contains("\n+ dtparam=audio=off\n"), "{shown}");
 }
 
-/// What editors of other systems leave.
+/// Line ends that editors of other systems write.
 #[test]
 fn ends_of_lines_stay_as_they_are() {
     for config_txt in ["dtparam=audio=on", "dtparam=audio=on\r\n[pi4]\r\nx=y", "dtparam=audio=on\r\n", "", "\n\n"] {
@@ -506,7 +506,7 @@ fn a_device_that_goes_leaves_the_lines_of_the_next_one() {
     assert_eq!(card.read("boot/firmware/config.txt"), "arm_boost=1\n");
 }
 
-/// All orders in which devices can go: what the others need stays, and at the end all is as it was.
+/// All orders in which devices can go. The lines that other devices need stay. At the end all files are as before.
 #[test]
 fn a_device_that_goes_takes_nothing_from_the_others() {
     let armbian = ARMBIAN_ENV.replace("PREFIX", "sun50i-h616");
@@ -533,11 +533,11 @@ fn a_device_that_goes_takes_nothing_from_the_others() {
             let before = card.snapshot();
             devices.iter().for_each(|device| drop(card.added(&[*device, &["--yes"]].concat())));
             for (done, gone) in order.iter().enumerate() {
-                let told = card.added(&[devices[*gone][0], "--undo", "--yes"]);
+                let printed = card.added(&[devices[*gone][0], "--undo", "--yes"]);
                 let now = card.snapshot();
                 for left in &order[done + 1..] {
                     let again = card.added(&[devices[*left], &["--yes"]].concat());
-                    assert!(again.contains("Nothing is left to change."), "{order:?} {gone}: {told}{again}");
+                    assert!(again.contains("Nothing is left to change."), "{order:?} {gone}: {printed}{again}");
                     assert_eq!(card.snapshot(), now, "{devices:?} {order:?}: {gone} goes, {left} stays");
                 }
             }
@@ -554,9 +554,9 @@ fn a_bus_that_a_section_of_the_user_needs_stays() {
     card.added(&["adxl345", "--yes"]);
     let printer_cfg = card.read(PRINTER);
     card.put(PRINTER, &format!("{printer_cfg}\n[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
-    let told = card.added(&["adxl345", "--undo", "--yes"]);
+    let printed = card.added(&["adxl345", "--undo", "--yes"]);
     let keeps = "/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] in printer.cfg needs it";
-    assert!(told.contains(keeps), "{told}");
+    assert!(printed.contains(keeps), "{printed}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
     card.put(PRINTER, PRINTER_CFG);
     card.added(&["adxl345", "--undo", "--yes"]);
@@ -594,8 +594,8 @@ fn a_full_disk_leaves_the_old_files() {
         .args(card.arguments(&["adxl345", "--yes"]))
         .output()
         .unwrap();
-    let told = String::from_utf8_lossy(&full.stdout);
-    assert!(told.contains("/var/lib/pinion-mcu/add/.add-adxl345.json: File too large"), "{told}");
+    let printed = String::from_utf8_lossy(&full.stdout);
+    assert!(printed.contains("/var/lib/pinion-mcu/add/.add-adxl345.json: File too large"), "{printed}");
     assert_eq!(card.snapshot(), before);
     card.added(&["adxl345", "--yes"]);
     card.added(&["adxl345", "--undo", "--yes"]);
@@ -698,9 +698,9 @@ fn the_host_restarts_and_measures_and_never_while_it_prints() {
         assert!(end(&address, server).iter().all(|request| request.starts_with("GET /printer/objects/query")));
     }
     let (address, server) = moonraker("standby");
-    let told = card.added(&["adxl345", "--yes", "--moonraker", &address]);
-    assert!(told.contains("it measures 470, 941, 9728 mm/s2: 1.00 of gravity"), "{told}");
-    assert!(told.contains("SHAPER_CALIBRATE"), "{told}");
+    let printed = card.added(&["adxl345", "--yes", "--moonraker", &address]);
+    assert!(printed.contains("it measures 470, 941, 9728 mm/s2: 1.00 of gravity"), "{printed}");
+    assert!(printed.contains("SHAPER_CALIBRATE"), "{printed}");
     let requests = end(&address, server);
     assert!(requests.iter().any(|request| request.starts_with("POST /printer/firmware_restart ")), "{requests:?}");
     // Nothing is changed, so nothing restarts.
@@ -713,12 +713,12 @@ fn the_host_restarts_and_measures_and_never_while_it_prints() {
 fn a_fan_turns_until_its_tachometer_counts_and_leds_light() {
     let card = Card::pi();
     let (address, server) = moonraker("standby");
-    let told = card.added(&["fan", "--yes", "--moonraker", &address]);
-    assert!(told.contains("the tachometer counts 1234 turns a minute at full speed"), "{told}");
-    let told = card.added(&["ws2812", "--yes", "--moonraker", &address]);
-    assert!(told.contains("the strip should be red now"), "{told}");
-    let told = card.added(&["fan", "--undo", "--yes", "--moonraker", &address]);
-    assert!(told.contains("The host has restarted without it."), "{told}");
+    let printed = card.added(&["fan", "--yes", "--moonraker", &address]);
+    assert!(printed.contains("the tachometer counts 1234 turns a minute at full speed"), "{printed}");
+    let printed = card.added(&["ws2812", "--yes", "--moonraker", &address]);
+    assert!(printed.contains("the strip should be red now"), "{printed}");
+    let printed = card.added(&["fan", "--undo", "--yes", "--moonraker", &address]);
+    assert!(printed.contains("The host has restarted without it."), "{printed}");
     let requests = end(&address, server);
     let scripts: Vec<&str> = requests
         .iter()
@@ -741,8 +741,8 @@ fn a_host_that_does_not_start_is_no_success() {
     card.added(&["relay", "--yes", "--undo", "--moonraker", &address]);
     end(&address, server);
     let (address, server) = moonraker("standby");
-    let told = card.added(&["bme280", "--yes", "--moonraker", &address]);
-    assert!(told.contains("the host reads 21.5 degrees"), "{told}");
+    let printed = card.added(&["bme280", "--yes", "--moonraker", &address]);
+    assert!(printed.contains("the host reads 21.5 degrees"), "{printed}");
     end(&address, server);
 }
 
@@ -753,14 +753,14 @@ fn a_file_that_is_the_user_s_stays() {
     card.put(&own, "[output_pin relay]\npin: host:GPIO5\n");
     card.put(PRINTER, &format!("[include pinion/*.cfg]\n{PRINTER_CFG}[mcu rpi]\nserial: /tmp/klipper_host_mcu\n[adxl345]\ncs_pin: rpi:None\n"));
     let before = card.snapshot();
-    let told = card.added(&["relay", "--yes"]);
-    assert!(told.contains("Nothing is left to change."), "{told}");
+    let printed = card.added(&["relay", "--yes"]);
+    assert!(printed.contains("Nothing is left to change."), "{printed}");
     assert_eq!(card.snapshot(), before);
-    let told = card.added(&["adxl345", "--yes"]);
-    assert!(told.contains(&format!("[adxl345] is in /{PRINTER} already, and stays as it is.")), "{told}");
+    let printed = card.added(&["adxl345", "--yes"]);
+    assert!(printed.contains(&format!("[adxl345] is in /{PRINTER} already, and stays as it is.")), "{printed}");
     assert!(!Path::new(&card.path(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"))).exists());
-    let told = card.added(&["light", "--yes"]);
-    assert!(told.contains("+ pin: rpi:GPIO17"), "the MCU's own name: {told}");
+    let printed = card.added(&["light", "--yes"]);
+    assert!(printed.contains("+ pin: rpi:GPIO17"), "the MCU's own name: {printed}");
     card.added(&["light", "--undo", "--yes"]);
     card.added(&["adxl345", "--undo", "--yes"]);
     assert_eq!(card.snapshot(), before);

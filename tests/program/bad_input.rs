@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Invalid input. From a host, each case ends in the firmware's shutdown text, and in a log line with the cause and the
+//! Invalid input. From a host, each case ends in the shutdown text of Klipper's C, and in a log line with the cause and the
 //! remedy. The process is ready for the next FIRMWARE_RESTART. A wrong file ends the command with one line.
 
 use std::fs::{self, File};
@@ -23,8 +23,8 @@ fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
         let line = timed(&mut client, line);
         client.send_line(&line).unwrap();
     }
-    let told = client.wait_shutdown(WAIT_MAX).unwrap();
-    assert_eq!(told.as_deref(), Some(reason), "{:?}", lines.last());
+    let stop = client.wait_shutdown(WAIT_MAX).unwrap();
+    assert_eq!(stop.as_deref(), Some(reason), "{:?}", lines.last());
     let line = || pinion.logged(&format!("shutdown: {reason}: "));
     pinion.until(&format!("a line with {words:?}"), || words.iter().all(|word| line().contains(word)));
     restarts(&mut client);

@@ -131,7 +131,7 @@ fn it_works_with_the_demonstration() {
 }
 
 #[test]
-fn nobody_else_reaches_it_unless_told() {
+fn nobody_else_reaches_it_by_default() {
     let (_pinion, camera) = start(&["--show"]);
     let elsewhere = SocketAddr::from(([127, 0, 0, 2], camera.port()));
     assert_eq!(TcpStream::connect(elsewhere).unwrap_err().kind(), ErrorKind::ConnectionRefused);
@@ -142,7 +142,7 @@ fn nobody_else_reaches_it_unless_told() {
     // Without an address it is this computer's own.
     let help = printed(&["sim", "--help"]);
     let words: Vec<&str> = help.split_whitespace().collect();
-    assert!(words.join(" ").contains("on 127.0.0.1:8410 unless told"), "{help}");
+    assert!(words.join(" ").contains("by default on 127.0.0.1:8410"), "{help}");
 }
 
 #[test]

@@ -189,7 +189,7 @@ fn each_dictionary_has_what_the_firmware_of_its_hosts_has() {
                 assert_eq!(ours, values, "{dialect} {name}");
                 continue;
             }
-            // The MCU's enumerations have at least the firmware's names, with the firmware's numbers. v0.11 had other
+            // The MCU's enumerations have at least the names of Klipper's C, with its numbers. v0.11 had other
             // numbers for the lines of GPIO chips. A host does not interpret these numbers.
             let ours = expanded(ours);
             for (entry, value) in expanded(values) {
@@ -377,7 +377,7 @@ fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
 }
 
 #[test]
-fn the_version_tells_the_state_of_the_sources_and_the_dictionary_tells_the_same() {
+fn the_version_names_the_state_of_the_sources_and_the_dictionary_has_the_same() {
     let version = printed(&["--version"]);
     let version = version.trim().strip_prefix("pinion ").unwrap();
     let (number, state) = version.split_once('-').unwrap_or((version, ""));

@@ -44,7 +44,7 @@ fn the_command_line_may_say_a_thing_twice_as_the_unit_and_its_options_do() {
 
 #[test]
 fn a_file_with_a_mistake_is_not_served_and_the_mistake_is_shown() {
-    for (config, told) in [
+    for (config, words) in [
         ("board = \"sim\"\nreal_time = true\n", ":2:1: real_time: there is no such key: did you mean realtime?"),
         ("board = \"sim\"\ncpu = one\n", ":2:7: "),
         ("board = \"toaster\"\n", ":1:9: board: there are the boards linux, sim and sim:FILE.toml"),
@@ -53,10 +53,10 @@ fn a_file_with_a_mistake_is_not_served_and_the_mistake_is_shown() {
         let mut pinion = Pinion::start_in(folder, &["run", "--config", path.to_str().unwrap()]);
         assert_eq!(pinion.end().code(), Some(1));
         let log = pinion.log();
-        assert!(log.contains(&format!("{}{told}", path.display())), "{log}");
+        assert!(log.contains(&format!("{}{words}", path.display())), "{log}");
         assert_eq!(log.lines().count(), 1, "{log}");
         let (code, _, log) = checked(config, &[]);
-        assert!(code == Some(1) && log.contains(told), "{log}");
+        assert!(code == Some(1) && log.contains(words), "{log}");
     }
     let (code, _, log) = texts(&output(&["run", "--config", "/nonexistent/pinion.toml"]));
     assert!(code == Some(1) && log.contains("/nonexistent/pinion.toml: No such file"), "{log}");

@@ -55,7 +55,7 @@ fn a_script_configures_a_simulated_mcu_and_sets_an_output() {
 }
 
 #[test]
-fn a_script_ends_at_its_first_error_and_tells_the_line() {
+fn a_script_ends_at_its_first_error_and_names_the_line() {
     let (code, out, log) = console(&["--board", "sim"], "get_uptime\n\nget_clok\nget_uptime\n");
     assert_eq!(code, Some(1));
     assert!(log.contains("line 3: there is no command get_clok; did you mean get_clock?"), "{log}");
@@ -76,7 +76,7 @@ fn a_script_ends_at_its_first_error_and_tells_the_line() {
 }
 
 #[test]
-fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
+fn a_shutdown_is_reported_with_its_text_and_reset_ends_it() {
     let script = "allocate_oids count=1\nallocate_oids count=1\nget_clock\n";
     let (code, out, log) = console(&["--board", "sim"], script);
     assert_eq!(code, Some(1), "{out}\n{log}");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The wire is cut, with outputs on: what the MCU does without its host, and what the next host finds. (On a CAN bus:
+//! The wire is cut, with outputs on: the MCU without its host, and with the next host. (On a CAN bus:
 //! `tests/kernel/guest/pinion/can.rs`.)
 
 use std::thread;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Full disks, read-only disks, and what a power cut leaves: none of it keeps the program from serving, if a host can
-//! find it at all.
+//! Full disks, read-only disks, and files that a power cut leaves. The program serves in spite of each, if a host can find
+//! it at all.
 
 use std::fs::{self, OpenOptions};
 use std::os::unix::fs::chown;
@@ -76,7 +76,7 @@ fn a_full_disk_has_room_for_the_link_of_the_service_in_place_of_a_stale_one() {
 }
 
 #[test]
-fn a_disk_without_room_for_the_link_is_told() {
+fn a_disk_without_room_for_the_link_is_reported() {
     let Some(pinion) = on_a_disk("mount -t tmpfs -o nr_inodes=1 full disk") else { return };
     let log = refused(pinion);
     assert!(log.contains("disk/tty cannot be made: No space left on device"), "{log}");
@@ -84,7 +84,7 @@ fn a_disk_without_room_for_the_link_is_told() {
 }
 
 #[test]
-fn a_disk_that_can_only_be_read_is_told() {
+fn a_disk_that_can_only_be_read_is_reported() {
     let fill = "mount -t tmpfs full disk; ln -s /dev/pts/no-longer-there disk/tty; mount -o remount,ro disk";
     let Some(pinion) = on_a_disk(fill) else { return };
     let log = refused(pinion);
@@ -125,8 +125,8 @@ fn a_status_socket_is_not_made_in_a_folder_of_another_user() {
     pinion.logged("serving on");
     assert_eq!(fs::read_dir(theirs).unwrap().count(), 0);
     pinion.logged("pinion trace --live will not be answered: ");
-    let told = pinion.logged("pinion status will not be answered: ");
-    assert!(told.contains("s.sock: the folder belongs to another user, nobody"), "{told}");
+    let line = pinion.logged("pinion status will not be answered: ");
+    assert!(line.contains("s.sock: the folder belongs to another user, nobody"), "{line}");
 }
 
 /// /run/pinion belongs to the service's user.
@@ -140,12 +140,12 @@ fn root_beside_the_service_has_its_socket_elsewhere() {
     let link = format!("/tmp/klipper_host_{name}");
     let prepare = "unset XDG_RUNTIME_DIR; mount -t tmpfs run /run; mkdir /run/pinion; chown nobody /run/pinion";
     let mut pinion = Pinion::start_mounted(folder, prepare, &["run", "--board", "sim", "-I", &link]);
-    let told = pinion.logged("status on ");
+    let line = pinion.logged("status on ");
     pinion.logged("serving on");
     let asked = output(&["status", "-I", &link]);
     pinion.signal(Signal::SIGTERM);
     pinion.end();
-    assert!(told.contains(&format!("status on /tmp/pinion-{name}.sock")), "{told}");
+    assert!(line.contains(&format!("status on /tmp/pinion-{name}.sock")), "{line}");
     assert!(asked.status.success(), "{}", String::from_utf8_lossy(&asked.stderr));
 }
 
@@ -161,7 +161,7 @@ fn a_log_on_a_full_disk_keeps_no_host_out() {
 /// A program that guessed would serve at a link that no host opens. So it refuses, and says how to mend the file.
 #[test]
 fn a_configuration_that_a_power_cut_has_damaged_is_refused_with_its_remedy() {
-    for (damaged, told) in [
+    for (damaged, line) in [
         ("\0".repeat(300), ":1:1: there are zero bytes, as a power cut leaves them: write the file anew"),
         (format!("board = \"sim\"\n{}", "\0".repeat(9)), ":2:1: there are zero bytes"),
         ("board = \"sim\"\nreal".to_owned(), ": write a key, = and its value, such as realtime = true"),
@@ -172,7 +172,7 @@ fn a_configuration_that_a_power_cut_has_damaged_is_refused_with_its_remedy() {
         let ended = output(&["run", "--config", path.to_str().unwrap()]);
         let log = String::from_utf8(ended.stderr).unwrap();
         assert_eq!(ended.status.code(), Some(1), "{log}");
-        assert!(log.contains(told), "{log}");
+        assert!(log.contains(line), "{log}");
     }
 }
 

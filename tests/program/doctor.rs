@@ -50,7 +50,7 @@ fn of_a_system_without_files_all_is_unknown_and_nothing_wrong() {
 }
 
 #[test]
-fn what_does_not_work_is_told_with_the_command_that_mends_it_and_the_exit_status() {
+fn a_finding_has_the_command_that_mends_it_and_the_exit_status() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let wants = root.join("etc/systemd/system/multi-user.target.wants");
@@ -266,10 +266,10 @@ fn false_processes_of_another_user_change_no_advice() {
         tree.process_in(pids.next().unwrap(), group, MALLORY, "", command);
     }
     let after = tree.doctor();
-    let told = "other users have processes with the names of a Pinion or a klippy, which do not count here: 100, 101, 102, 103, 104 and 15 more\n";
+    let ignored = "other users have processes with the names of a Pinion or a klippy, which do not count here: 100, 101, 102, 103, 104 and 15 more\n";
     let remedy = "           -> if one of them is yours, have a service start it\n";
-    assert!(after.contains(told), "{after}");
-    assert_eq!(after.replace(&format!("  ok       {told}{remedy}"), ""), before);
+    assert!(after.contains(ignored), "{after}");
+    assert_eq!(after.replace(&format!("  ok       {ignored}{remedy}"), ""), before);
 }
 
 /// The host may have processes of any name, too, in its own unit. It gets no more groups by that.
@@ -281,10 +281,10 @@ fn a_false_pinion_of_the_host_changes_no_advice() {
     tree.put("home/pi/pins.toml", "watchdog = true\n");
     tree.process(5, "klipper", 54321, "", &["pinion", "run", "--config", "/home/pi/pins.toml"]);
     let after = tree.doctor();
-    let told = "other users have processes with the names of a Pinion or a klippy, which do not count here: 5\n";
+    let ignored = "other users have processes with the names of a Pinion or a klippy, which do not count here: 5\n";
     let remedy = "           -> if one of them is yours, have a service start it\n";
-    assert_eq!(after.replace(&format!("  ok       {told}{remedy}"), ""), before);
-    assert!(after.contains(told) && !after.contains("usermod"), "{after}");
+    assert_eq!(after.replace(&format!("  ok       {ignored}{remedy}"), ""), before);
+    assert!(after.contains(ignored) && !after.contains("usermod"), "{after}");
 }
 
 /// klippy would refuse the configuration. So the doctor does not know its devices.
@@ -394,7 +394,7 @@ fn only_the_callers_own_processes_count_beside_those_of_services_and_root() {
             doctor.args(["doctor", "--json"]).uid(uid).gid(uid).env_remove("SUDO_UID");
             sudo_uid.map(|uid| doctor.env("SUDO_UID", uid));
             let (_, _, findings) = parsed(&doctor.output().unwrap());
-            // All but what the processors are doing.
+            // All findings except the state of the processors.
             let findings: Vec<Value> = findings.into_iter().filter(|finding| finding["check"] != "latency").collect();
             findings
         };

@@ -54,7 +54,7 @@ fn a_host_can_read_that_the_guardian_is_lost_even_if_it_is_busy_for_a_moment() {
 
 /// As systemd reads it for `systemctl status`.
 #[test]
-fn the_service_manager_is_told_what_the_program_does() {
+fn the_service_manager_knows_what_the_program_does() {
     let folder = tempfile::tempdir().unwrap();
     let [path, link] = ["notify", "tty"].map(|name| folder.path().join(name));
     let manager = UnixDatagram::bind(&path).unwrap();
@@ -119,8 +119,8 @@ fn a_guardian_that_is_stopped_does_not_outlive_the_program() {
     signal(guardian, Signal::SIGSTOP);
     pinion.signal(Signal::SIGTERM);
     assert!(pinion.end().success(), "{}", pinion.log());
-    let told = "is stopped or hangs, and would keep the lines: Pinion kills it";
-    assert!(pinion.log().contains(told), "{}", pinion.log());
+    let line = "is stopped or hangs, and would keep the lines: Pinion kills it";
+    assert!(pinion.log().contains(line), "{}", pinion.log());
     pinion.until("the guardian's end", || is_gone(guardian));
 }
 

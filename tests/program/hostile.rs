@@ -133,7 +133,7 @@ fn a_program_that_can_open_no_further_file_serves_on_and_the_next_host_when_it_c
     drop(host);
     let refused = pinion.logged("cannot be used any more");
     assert!(refused.contains("Too many open files") && refused.contains("raise LimitNOFILE"), "{refused}");
-    // Nobody can be answered there meanwhile.
+    // While the program can open no file, nobody gets an answer on these sockets.
     let _status = std::os::unix::net::UnixStream::connect(pinion.link().with_extension("sock"));
     let _trace = std::os::unix::net::UnixStream::connect(pinion.link().with_extension("trace"));
     limit_files(&pinion, Some(256));

@@ -8,7 +8,7 @@ use std::process::Command;
 
 use pinion_testkit::here;
 
-/// Finds the extension as KIAUH's menu does, and calls what its entries call. The answers come from the standard input.
+/// Finds the extension as KIAUH's menu does, and calls the functions of its entries. The answers come from the standard input.
 const MENU: &str = r#"
 import sys
 from extensions.extensions_menu import ExtensionsMenu, ExtensionSubmenu
@@ -21,7 +21,7 @@ menu.print_menu()
 menu.options[sys.argv[1]].method()
 "#;
 
-/// A program of root's that only says what it was asked.
+/// A program of root's that only prints its arguments.
 const SUDO: &str =
     "#!/bin/sh\necho \"$*\" >>\"$SAID\"\ncase $FAILS in ?*) case $* in *$FAILS*) exit 100 ;; esac ;; esac\n";
 
@@ -55,15 +55,15 @@ fn pinion_is_in_kiauh_s_menu_of_extensions() {
             .env("HOME", folder.path())
             .output()
             .unwrap();
-        let told = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success(), "{told}{}", String::from_utf8_lossy(&output.stderr));
-        (told, fs::read_to_string(&said).unwrap_or_default().replace("env DEBIAN_FRONTEND=noninteractive ", ""))
+        let shown = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{shown}{}", String::from_utf8_lossy(&output.stderr));
+        (shown, fs::read_to_string(&said).unwrap_or_default().replace("env DEBIAN_FRONTEND=noninteractive ", ""))
     };
     let (install, update, remove) = ("1", "2", "3");
     let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().unwrap().name;
-    let (told, commands) = choose(install, "\\n", "none", "");
+    let (shown, commands) = choose(install, "\\n", "none", "");
     let installed = format!("apt-get update\napt-get install -y pinion-mcu\nusermod -aG tty {user}\n");
-    assert_eq!(commands, format!("{installed}systemctl enable --now pinion-mcu.service\n"), "{told}");
+    assert_eq!(commands, format!("{installed}systemctl enable --now pinion-mcu.service\n"), "{shown}");
     // Klipper's own program is in use.
     assert_eq!(choose(install, "\\n", "klipper-mcu.service", "").1, installed);
     // A release has apt's source beside it.
@@ -73,8 +73,8 @@ fn pinion_is_in_kiauh_s_menu_of_extensions() {
     let commands = choose(install, "n\\n", "none", "").1;
     assert!(commands.contains("/pinion.sources /etc/apt/sources.list.d/pinion.sources\n"), "{commands}");
     assert!(commands.ends_with(&installed), "{commands}");
-    let (told, _) = choose(install, "\\n", "none", "apt-get install");
-    assert!(told.contains("apt-get install -y pinion-mcu: exit status 100"), "{told}");
+    let (shown, _) = choose(install, "\\n", "none", "apt-get install");
+    assert!(shown.contains("apt-get install -y pinion-mcu: exit status 100"), "{shown}");
 
     // Nothing restarts unless the user says so.
     let updated = "apt-get update\napt-get install -y --only-upgrade pinion-mcu\n";
@@ -83,7 +83,7 @@ fn pinion_is_in_kiauh_s_menu_of_extensions() {
     assert_eq!(commands, format!("{updated}systemctl restart pinion-mcu.service\n"));
 
     assert_eq!(choose(remove, "\\n", "pinion-mcu.service", "").1, "");
-    let (told, commands) = choose(remove, "y\\n", "pinion-mcu.service", "");
+    let (shown, commands) = choose(remove, "y\\n", "pinion-mcu.service", "");
     assert!(commands.starts_with("apt-get remove -y pinion-mcu\n"), "{commands}");
-    assert!(told.contains("Remove [mcu host]"), "{told}");
+    assert!(shown.contains("Remove [mcu host]"), "{shown}");
 }

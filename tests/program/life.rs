@@ -208,7 +208,7 @@ fn force_shutdown_stops_the_mcu_and_a_reset_starts_it_anew() {
 }
 
 #[test]
-fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
+fn sigterm_informs_the_host_and_drives_outputs_to_their_shutdown_values() {
     let mut pinion = Pinion::simulated(&[]);
     let mut client = pinion.configured(&["config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0"]);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
@@ -271,7 +271,7 @@ fn terminal_bytes() -> usize {
 }
 
 #[test]
-fn sigusr1_tells_how_late_timers_were() {
+fn sigusr1_logs_how_late_timers_were() {
     let pinion = Pinion::simulated(&[]);
     pinion.logged("serving on");
     pinion.signal(Signal::SIGUSR1);
@@ -384,7 +384,7 @@ fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
 }
 
 #[test]
-fn a_log_that_is_read_again_tells_how_much_of_it_was_left_out() {
+fn a_log_that_is_read_again_says_how_much_of_it_was_left_out() {
     let (reader, mut pinion) = with_full_log();
     let mut client = pinion.client();
     // Each reset gives three log lines. Together that is more than the program writes.

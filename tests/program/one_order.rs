@@ -100,7 +100,7 @@ fn a_display_sees_its_line_and_its_bytes_in_order() {
 }
 
 #[test]
-fn the_clock_is_told_beside_a_slow_transfer() {
+fn the_clock_is_answered_beside_a_slow_transfer() {
     let (pinion, _) = slow_printer(400);
     let mut client = pinion.configured(DISPLAY);
     client.send_line("spi_transfer oid=0 data=2a").unwrap();

@@ -23,8 +23,8 @@ fn preinst(architecture: &str, machine: &str) -> Output {
 #[test]
 fn the_package_refuses_the_original_zero() {
     let refused = preinst("armhf", "armv6l");
-    let told = String::from_utf8(refused.stderr).unwrap();
-    assert!(!refused.status.success() && told.contains("ARMv6") && told.contains("Use a Zero 2"), "{told}");
+    let words = String::from_utf8(refused.stderr).unwrap();
+    assert!(!refused.status.success() && words.contains("ARMv6") && words.contains("Use a Zero 2"), "{words}");
     for (architecture, machine) in
         [("armhf", "armv7l"), ("armhf", "aarch64"), ("arm64", "aarch64"), ("amd64", "x86_64"), ("armel", "armv6l")]
     {

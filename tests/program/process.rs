@@ -250,8 +250,8 @@ pub fn as_nobody(command: &mut Command) -> &mut Command {
     command
 }
 
-/// A copy of the program in this folder, because nobody else may read cargo's. Another process copies it. A test that
-/// starts a program meanwhile would inherit our file, and a file that is open for writing cannot be run.
+/// A copy of the program in this folder, because nobody else may read cargo's. Another process copies it: a test
+/// that starts a program at that moment would inherit our file, and the kernel runs no file that is open for writing.
 pub fn program_in(folder: &Path) -> PathBuf {
     let program = folder.join("pinion");
     let simulator = simulator::build_beside(pinion_path());
@@ -280,7 +280,7 @@ pub fn texts(output: &std::process::Output) -> (Option<i32>, String, String) {
     (output.status.code(), text(&output.stdout), text(&output.stderr))
 }
 
-/// What `pinion` prints.
+/// The output of `pinion`.
 pub fn printed(args: &[&str]) -> String {
     String::from_utf8(output(args).stdout).unwrap()
 }

@@ -95,7 +95,7 @@ fn a_stop_leaves_no_memory_behind() {
 
 /// SIGSTOP stops all threads, as a frozen control group does.
 #[test]
-fn a_program_that_was_stopped_is_told_from_a_late_host() {
+fn a_program_that_was_stopped_is_distinguished_from_a_late_host() {
     let pinion = Pinion::simulated(&[]);
     let mut client = pinion.configured(&[OUTPUT]);
     pinion.signal(Signal::SIGSTOP);
@@ -106,7 +106,7 @@ fn a_program_that_was_stopped_is_told_from_a_late_host() {
     assert!(!pinion.log().contains("look at the host's load"));
 }
 
-/// The guardian keeps what the program has recorded.
+/// The guardian keeps the recording of the program.
 #[test]
 fn a_program_that_was_killed_leaves_its_trace() {
     let pinion = Pinion::start(&["run"]);
@@ -212,7 +212,7 @@ fn root_writes_nothing_into_a_folder_of_another_user() {
     pinion.logged("state: the folder belongs to another user, nobody");
 }
 
-/// As users of the socket's group may do. A recording is larger than what the kernel keeps for a client.
+/// As users of the socket's group may do. A recording is larger than the kernel's buffer for a client.
 #[test]
 fn clients_that_do_not_read_keep_no_stop_from_its_recording() {
     let pinion = Pinion::simulated(&["--trace-edges"]);

@@ -79,7 +79,7 @@ fn a_program_whose_search_is_killed_says_so_and_serves_on() {
 }
 
 #[test]
-fn there_is_no_search_where_the_dialect_is_told() {
+fn there_is_no_search_where_the_dialect_is_set() {
     let pinion = Pinion::simulated(&["--dialect", "master"]);
     assert_eq!(search_of(pinion.pid()), None);
 }

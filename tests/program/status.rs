@@ -50,7 +50,7 @@ const CONFIGURATION: &[&str] = &[
 ];
 
 #[test]
-fn an_mcu_tells_how_it_is_in_each_state() {
+fn an_mcu_reports_its_state_in_each_phase() {
     let mut pinion = Pinion::simulated(&["--dialect", "master"]);
     let socket = socket(&pinion);
     pinion.until("the socket", || exists(&socket));

@@ -79,14 +79,14 @@ fn a_file_that_was_not_printed_is_an_error_at_the_end() {
 
 #[test]
 fn a_small_file_takes_no_more_memory_than_a_print() {
-    for (arc, told) in [
+    for (arc, words) in [
         ("G2 I99999999999\n", "part.gcode:2: `I99999999999` is out of range: correct it"),
         ("G2 I90000\n", ": the path up to here is too long to be compared: correct its places and arcs"),
     ] {
         let (folder, gcode) = folder_with("part.gcode", &format!("G1 X1 Y1 Z1\n{}", arc.repeat(2000)));
         let (code, said) = limited(&["sim", "--compare", gcode.to_str().unwrap()]);
         assert_eq!((code, said.lines().count()), (Some(1), 1), "{said}");
-        assert!(said.contains(told), "{said}");
+        assert!(said.contains(words), "{said}");
         drop(folder);
     }
 }

@@ -133,9 +133,9 @@ fn the_page_has_each_shutdown_text_and_no_other() {
     let dictionary: Value = serde_json::from_slice(&output(&["dict", "--board", "sim"]).stdout).unwrap();
     let texts = dictionary["enumerations"]["static_string_id"].as_object().unwrap();
     let texts: BTreeSet<&str> = texts.keys().map(String::as_str).collect();
-    let told: BTreeSet<&str> = first_cells("## Shutdown texts").into_iter().flat_map(quotations).collect();
-    let missing: Vec<_> = texts.difference(&told).collect();
-    let unknown: Vec<_> = told.difference(&texts).collect();
+    let explained: BTreeSet<&str> = first_cells("## Shutdown texts").into_iter().flat_map(quotations).collect();
+    let missing: Vec<_> = texts.difference(&explained).collect();
+    let unknown: Vec<_> = explained.difference(&texts).collect();
     assert!(
         missing.is_empty() && unknown.is_empty(),
         "the page lacks {missing:?}, and has {unknown:?}, which nobody says"

@@ -418,8 +418,8 @@ impl Host {
     /// Compares the positions that the MCU reports with the printer's.
     pub fn compare(&mut self, printer: &mut Printer) {
         for (axis, (name, _)) in AXES.iter().enumerate() {
-            let told = self.position(printer, axis);
-            assert_eq!(printer.steps_of(axis), told, "{name}: the printer's position, and the MCU's");
+            let known = self.position(printer, axis);
+            assert_eq!(printer.steps_of(axis), known, "{name}: the printer's position, and the MCU's");
         }
         let lost: u64 = printer.probe.axes().map(|axis| axis.lost_steps).sum();
         assert_eq!(lost, 0, "steps against the end of an axis");

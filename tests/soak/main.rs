@@ -320,7 +320,7 @@ impl Day {
         assert!(more < GROWTH_BYTES, "a reset MCU has {more} bytes more than the first");
     }
 
-    fn tell(&self, took: std::time::Duration) {
+    fn report(&self, took: std::time::Duration) {
         let now = self.printer.rig.now();
         println!(
             "{} s in {:.1} s, {} wraps of the clock: {:?}, at most {} bytes more after a reset",
@@ -352,5 +352,5 @@ fn a_day_of_printing_with_faults_leaks_nothing_and_loses_no_step() {
         let soon = day.printer.rig.now() + 60 * SECOND;
         day.session(end.max(soon));
     }
-    day.tell(began.elapsed());
+    day.report(began.elapsed());
 }

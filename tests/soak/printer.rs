@@ -205,8 +205,8 @@ impl Printer {
     /// Checks that the MCU's clock of 64 bits is the bench's.
     pub fn compare_clocks(&mut self) {
         let uptime = self.ask("get_uptime", &[], "uptime");
-        let told = u64::from(uptime.u32("high").unwrap()) << 32 | u64::from(uptime.u32("clock").unwrap());
-        assert_eq!(told, self.start + self.rig.now());
+        let ticks = u64::from(uptime.u32("high").unwrap()) << 32 | u64::from(uptime.u32("clock").unwrap());
+        assert_eq!(ticks, self.start + self.rig.now());
     }
 
     // ---- what the printer shows

@@ -169,7 +169,7 @@ mod tests {
         assert!(lens.place([0.0, -1e9, 1e9]).iter().all(|pixel| pixel.is_finite()));
     }
 
-    /// The eye is above all that is printed. So what lies higher hides what lies lower, and never the other way round.
+    /// The eye is above the whole print. So a higher place may hide a lower one, and never the other way round.
     #[test]
     fn the_eye_is_above_the_room() {
         let lens = Lens::new(&ROOM, [0.0, 0.0, 500.0, 600.0]);

@@ -320,7 +320,7 @@ fn a_slow_viewer_loses_frames_and_holds_nobody_up() {
     // The quick one gets each frame, or nearly so on a busy computer.
     let drawn = camera.drawn() - before;
     assert!(drawn < 60, "{drawn}");
-    // The slow one has some in the kernel's buffers. What comes then is new.
+    // The slow one has some in the kernel's buffers. The pictures after these are new.
     let backlog = (0..1000).take_while(|_| {
         let start = Instant::now();
         assert_jpeg(&slow.frame());

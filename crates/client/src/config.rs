@@ -2,8 +2,6 @@
 //! Configures an MCU as klippy does: oids, config commands, their checksum. It also resets an MCU that is configured or
 //! shut down.
 
-#![forbid(unsafe_code)]
-
 use std::time::{Duration, Instant};
 
 use flate2::Crc;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A host with a text interface: lines of commands in, responses out (`pinion console`).
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
@@ -451,7 +449,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_told_with_what_may_have_been_meant() {
+    fn mistakes_are_reported_with_a_likely_meaning() {
         let (peer, mut console) = console();
         let mut wrong = |line: &str| say(&mut console, line).unwrap_err();
         assert_eq!(wrong("get_clok"), "there is no command get_clok; did you mean get_clock?");

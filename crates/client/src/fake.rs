@@ -2,8 +2,6 @@
 //! The other end of the wire for tests: a peer over a socket, and an MCU with a few commands. The peer loses and
 //! corrupts the blocks that the test names.
 
-#![forbid(unsafe_code)]
-
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::thread::{self, JoinHandle};

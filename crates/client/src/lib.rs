@@ -63,7 +63,7 @@ pub enum Error {
     },
     /// The MCU shut down.
     Shutdown {
-        /// The firmware's text.
+        /// The MCU's text.
         reason: String,
     },
     /// The data dictionary is invalid.

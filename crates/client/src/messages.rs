@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Commands and responses by their names in a data dictionary.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::time::Instant;
 

@@ -6,8 +6,6 @@
 //! acknowledgement. After the retransmission timeout, or at once after a NAK, all of them are sent again, after a sync
 //! byte. An empty block that repeats the last acknowledgement is a NAK.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::path::Path;
 use std::time::{Duration, Instant};

@@ -155,7 +155,7 @@ fn a_print_allocates_nothing_once_configured() {
 
 /// The caller provides the memory for the status.
 #[test]
-fn a_status_that_is_told_amid_steps_allocates_nothing() {
+fn a_status_that_is_reported_amid_steps_allocates_nothing() {
     let mut rig = Rig::new();
     rig.bench.script_ds18b20("28", &[Some(20_000)]);
     rig.bench.state().counted.insert(13);

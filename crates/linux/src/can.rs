@@ -52,13 +52,6 @@ pub struct CanInterface {
     pub is_virtual: bool,
 }
 
-/// The names of this computer's CAN interfaces, in order.
-pub fn interfaces() -> Vec<String> {
-    let is_can =
-        |name: &String| attributes::text(&Path::new(NET).join(name).join("type")).as_deref() == Some(ARPHRD_CAN);
-    attributes::names(Path::new(NET)).into_iter().filter(is_can).collect()
-}
-
 /// Whether there is a network interface of this name that is no CAN interface.
 pub fn is_other(name: &str) -> bool {
     attributes::text(&Path::new(NET).join(name).join("type")).is_some_and(|type_| type_ != ARPHRD_CAN)

@@ -169,7 +169,7 @@ impl KernelTick {
     }
 }
 
-/// Looks every millisecond whether something is done, until `deadline` (CLOCK_MONOTONIC). Returns whether it is done.
+/// Checks every millisecond whether something is done, until `deadline` (CLOCK_MONOTONIC). Returns whether it is done.
 pub fn wait_until(deadline: Duration, mut is_done: impl FnMut() -> bool) -> bool {
     loop {
         if is_done() {
@@ -201,7 +201,7 @@ mod tests {
             KernelTick::of(seen_us.map(|us| 1000 * us), 4 * MS).map(|tick| tick.at_ns / 1000 % 4000)
         };
         assert_eq!(tick([3998, 7999, 12_040, 15_998, 19_999, 24_024, 27_999]), Some(3998));
-        // The third look was too early.
+        // The third check was too early.
         assert_eq!(tick([3998, 7999, 11_925, 15_997, 19_999, 24_024, 27_999]), Some(3997));
         assert_eq!(tick([40, 7998, 11_999, 16_000, 20_001, 24_000, 27_998]), Some(3998));
         assert_eq!(tick([1000, 6500, 8000, 13_700, 16_000, 20_000, 24_000]), None);

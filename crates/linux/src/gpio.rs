@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_chip_is_told_from_one_that_is_none() {
+    fn a_missing_chip_is_distinguished_from_one_that_is_none() {
         let dev = tempfile::tempdir().unwrap();
         let open = |chip| open(dev.path(), chip, 0, reason::NOT_OUTPUT).err().unwrap();
         assert_eq!(open(3).reason, reason::CHIP_MISSING);

@@ -174,8 +174,8 @@ mod tests {
         ] {
             let error = failure("/dev/i2c-1 address 0x48", (2, 200), &io::Error::from_raw_os_error(code));
             assert_eq!(error.status, status, "{code}");
-            let told = error.trouble.to_string();
-            assert!(told.starts_with("/dev/i2c-1 address 0x48: ") && told.contains(remedy), "{told}");
+            let said = error.trouble.to_string();
+            assert!(said.starts_with("/dev/i2c-1 address 0x48: ") && said.contains(remedy), "{said}");
         }
     }
 

@@ -358,7 +358,7 @@ mod tests {
         Arc::new(VirtualClock::at(Clock::EPOCH))
     }
 
-    /// A controller like that of spi-bcm2835, and the chip select lines. The clock moves only with a transfer.
+    /// A controller like the one of spi-bcm2835, and the chip select lines. The clock moves only with a transfer.
     #[derive(Default)]
     struct Wires {
         clock: bool,

@@ -356,8 +356,8 @@ mod tests {
             assert_eq!(has_device(line, device.0, device.1), is_its, "{line} {device:?}");
         }
         for other in ["/dev/null", "/dev/zero"] {
-            let told = find_line(Path::new(other)).unwrap_err().to_string();
-            assert!(told.starts_with(&format!("{other}: it is no serial port that works")), "{told}");
+            let said = find_line(Path::new(other)).unwrap_err().to_string();
+            assert!(said.starts_with(&format!("{other}: it is no serial port that works")), "{said}");
         }
     }
 
@@ -444,14 +444,14 @@ mod tests {
     fn what_is_no_port_is_refused() {
         let dev = tempfile::tempdir().unwrap();
         fs::write(dev.path().join("ttyS0"), "").unwrap();
-        for (name, is_console, told) in [
+        for (name, is_console, said) in [
             ("ttyS0", false, "ttyS0: it is no serial port that works"),
             ("ttyS1", false, "ttyS1: it is gone: plug"),
             ("ttyS0", true, "the kernel writes its messages to it: remove its console="),
         ] {
             let uart = Uart { name: name.into(), device: (0, 0), links: vec![], is_console };
             let stop = Port::open(dev.path(), &uart, 40_000).unwrap_err();
-            assert!(stop.to_string().contains(told), "{stop}");
+            assert!(stop.to_string().contains(said), "{stop}");
         }
     }
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The boards of a simulated printer: each has a link, a recording and threads of its own, in one process.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -77,10 +75,10 @@ impl Others {
             let name = format!("board {}", board.name());
             let serve = move || {
                 let timing = board.timing();
-                let told = || {
+                let served = || {
                     ready.fetch_add(1, Ordering::SeqCst);
                 };
-                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, told);
+                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, served);
                 if let Err(trouble) = &ended {
                     log::error!("{trouble}");
                 }

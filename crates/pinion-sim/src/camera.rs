@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --camera`: the simulated printer as a webcam.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
@@ -24,11 +22,11 @@ use targets::Targets;
 
 mod targets;
 
-/// Where the camera is served unless told otherwise.
+/// Where the camera is served by default.
 pub(crate) const ADDRESS: &str = "127.0.0.1:8410";
 /// The camera waits for everything else on this computer.
 const NICE: i32 = 10;
-/// Time between two looks at the steps: the printer keeps half a second of them.
+/// Time between two reads of the steps: the printer keeps half a second of them.
 const READ_PERIOD: Duration = Duration::from_millis(100);
 /// A print begins after a pause of this time, with a piece that is lower than the last one by this much.
 const PAUSE_S: f64 = 20.0;

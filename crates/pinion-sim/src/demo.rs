@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The demonstration. It identifies an MCU, configures it, homes its axes, heats its bed, and checks each result.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 

@@ -2,8 +2,6 @@
 //! The status of the MCU that this program serves, for what it shows to people. The program asks its own socket, as
 //! `pinion status` does. So nothing of the MCU's runtime is shared, and the core is never made to wait.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};

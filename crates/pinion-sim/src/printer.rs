@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated printer, shown at work by our own client.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Display;
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -63,7 +61,7 @@ pub(crate) struct SimArgs {
     /// one line for each change elsewhere
     #[arg(long, conflicts_with_all = ["demo", "print_config", "print_board"])]
     show: bool,
-    /// Serve a picture of the printer as a webcam for Mainsail, Fluidd or a browser, on 127.0.0.1:8410 unless told
+    /// Serve a picture of the printer as a webcam for Mainsail, Fluidd or a browser, by default on 127.0.0.1:8410
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = camera::ADDRESS,
           value_parser = camera::parse, conflicts_with_all = ["print_config", "print_board"])]
     camera: Option<String>,
@@ -286,7 +284,7 @@ fn serve(
         match &owner {
             Some(owner) => begin(args, owner, &probe, &right),
             None if io::stdout().is_terminal() => {
-                tell_how_to_connect((args, &link), if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
+                report_how_to_connect((args, &link), if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
             }
             None => {}
         }
@@ -313,7 +311,7 @@ fn serve(
 /// Says how to start klippy on somebody's printer, or tries the printer and ends the program.
 fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<AtomicBool>) {
     let (Some(attempt), Place::Folder(_)) = (&owner.attempt, &owner.place) else {
-        owner.place.next(&args.own).iter().for_each(tell);
+        owner.place.next(&args.own).iter().for_each(say);
         return;
     };
     let ended = asked_to_end().unwrap_or_else(|error| {
@@ -350,15 +348,15 @@ fn show((args, link): (&SimArgs, &Path), plan: &Plan, probe: &SimProbe, (right, 
     if args.demo {
         return end();
     }
-    tell_how_to_connect((args, link), "Ctrl-C");
+    report_how_to_connect((args, link), "Ctrl-C");
 }
 
-fn tell_how_to_connect((args, link): (&SimArgs, &Path), end: &str) {
+fn report_how_to_connect((args, link): (&SimArgs, &Path), end: &str) {
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
-    tell("");
-    tell(format_args!("The simulated printer goes on until {end}. To connect a Klipper host:"));
-    tell(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", link.display()));
-    tell("  klippy.py printer.cfg");
+    say("");
+    say(format_args!("The simulated printer goes on until {end}. To connect a Klipper host:"));
+    say(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", link.display()));
+    say("  klippy.py printer.cfg");
 }
 
 fn demonstration(link: &Path, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
@@ -367,23 +365,23 @@ fn demonstration(link: &Path, plan: &Plan, probe: &SimProbe) -> Result<bool, Str
     // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
-        tell(format_args!(
+        say(format_args!(
             "       the printer's {} axis stands at {:.3} mm, {} steps lost",
             axis.name, axis.position_mm, axis.lost_steps
         ));
     }
     for heater in probe.heaters() {
-        tell(format_args!("       the printer's {} is at {:.1} C", heater.name, heater.celsius));
+        say(format_args!("       the printer's {} is at {:.1} C", heater.name, heater.celsius));
     }
     let lost: u64 = probe.axes().map(|axis| axis.lost_steps).sum();
     let all_right = report.passed() && lost == 0;
-    tell(if all_right { "all of it was right" } else { "NOT all of it was right" });
+    say(if all_right { "all of it was right" } else { "NOT all of it was right" });
     Ok(all_right)
 }
 
 /// Prints a line about the demonstration. Errors are ignored: the printer serves its host even if nothing can be
 /// printed.
-fn tell(line: impl Display) {
+fn say(line: impl Display) {
     let mut page = Page::default();
     page.line(line);
     if let Err(error) = print(&page) {

@@ -4,8 +4,6 @@
 //! On a terminal it is a picture in the lowest rows, drawn again in place. The log continues to scroll in the rows
 //! above. Anywhere else each change is a line, or a block for a picture.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --toolpath` and `--compare`: the path that the motors went, written and compared when the program ends.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

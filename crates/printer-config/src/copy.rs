@@ -4,8 +4,6 @@
 //! A file keeps its place relative to the main one, so the includes stay as they are. Files that are not below the main
 //! one's folder get a place in [`OUTSIDE`], and the line that includes them names it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The files of a configuration: how they are read, and how an include's pattern finds them.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsStr;
 use std::fs;
 use std::io;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The lines of a file, as Python's configparser reads them after klippy has cut off the comments.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;

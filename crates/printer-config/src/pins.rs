@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The names of pins, as klippy reads them (klippy/pins.py), and `[board_pins]`.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::fmt;
 

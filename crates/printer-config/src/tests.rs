@@ -201,7 +201,7 @@ fn constants_of_kalico_are_put_in() {
 }
 
 #[test]
-fn a_copy_differs_only_where_it_is_told_and_stays_in_its_folder() {
+fn a_copy_differs_only_where_asked_and_stays_in_its_folder() {
     let root = tempfile::tempdir().unwrap();
     let home = root.path().join("home");
     fs::create_dir_all(home.join("sub")).unwrap();

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The values of options, as klippy's `ConfigWrapper` reads them, in its words.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Display;
 
 use crate::{Config, Place, Section, Setting, Trouble};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Message blocks: length, sequence, payload, CRC, sync (docs/Protocol.md, "Message blocks").
 
-#![forbid(unsafe_code)]
-
 use super::crc::crc16_ccitt;
 
 /// Bytes of an empty block.
@@ -270,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_that_came_before_is_told_from_one_behind_garbage() {
+    fn a_block_that_came_before_is_distinguished_from_one_behind_garbage() {
         let mut receiver = Receiver::default();
         let mut refused = |bytes: &[u8]| match receiver.next(bytes) {
             (_, Received::Nak(why)) => Some(why),

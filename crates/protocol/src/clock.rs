@@ -4,8 +4,6 @@
 //! In a program, a time is a `u64` that never wraps. It has 32 bits only on the wire. A 32-bit clock from the other end
 //! is widened to the time nearest to a reference.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 /// A time in ticks. Tick 0 of the wire is [`Clock::EPOCH`], 2^32 ticks above zero. So times before tick 0 can also be

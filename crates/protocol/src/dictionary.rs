@@ -2,8 +2,6 @@
 //! The data dictionary (docs/Protocol.md, "Data dictionary"). klippy reads it through `identify`. Its batch mode reads
 //! it from a file (`-d`).
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Read, Write};
 
 use flate2::Compression;

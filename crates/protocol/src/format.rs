@@ -2,8 +2,6 @@
 //! Message formats, for example `queue_step oid=%c interval=%u count=%hu add=%hi`: how to parse them, and the Rust
 //! types for their parameters.
 
-#![forbid(unsafe_code)]
-
 use super::Malformed;
 use super::clock::Clock;
 use super::vlq::{Reader, Writer};

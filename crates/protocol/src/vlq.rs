@@ -2,8 +2,6 @@
 //! Variable length quantities: seven bits a byte, high bits first. The top bit is set on all bytes except the last. A
 //! number is negative if bits 5 and 6 of the first byte are both set.
 
-#![forbid(unsafe_code)]
-
 use super::Malformed;
 
 /// Longest encoding that a writer makes, in bytes.

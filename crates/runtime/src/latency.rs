@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Measures how late this computer wakes up, and judges for which outputs that is good enough.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;

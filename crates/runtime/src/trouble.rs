@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Errors of this crate when the kernel refuses a thread, a process or memory.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::io;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A simulated printer, assembled and driven as a board.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -22,13 +20,14 @@ use super::engine::assemble::{Motion, assemble};
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
-use super::engine::physics::{Fan, Heater, Lamp, Switch};
+use super::engine::physics::{Fan, Heater, Lamp};
 use super::engine::serial::{SerialDevice, SerialWire};
 use super::engine::spi::{MISO, SpiBus, SpiDevice};
 use super::engine::time::{Drift, LATE_LIMIT, PrinterTime};
 use super::engine::wire::{
-    ControllerPin, DirectionPin, EnablePin, EndstopPin, FanPin, FixedAnalog, FixedInput, FreePin, HeaterPin, Kind,
-    LampPin, SimAdc, SimEdges, SimLine, SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
+    ControllerPin, FreePin, Kind, SimAdc, SimEdges, SimLine, SimPwm, TachometerPin, WiredPin, direction_pin,
+    enable_pin, endstop_pin, fan_enable_pin, fan_pin, fixed_analog, fixed_input, heater_pin, lamp_pin, step_pin,
+    thermistor_pin,
 };
 use super::engine::world::World;
 use super::part::workshop::Workshop;
@@ -96,9 +95,9 @@ impl SimWorld {
         };
         Motion { axes: workshop.world.axes, carriages: workshop.world.carriages } = assemble(&printer)?;
         for (part, axis) in config.axes.iter().zip(workshop.world.axes.clone()) {
-            workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
-            workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));
-            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.rail().clone()));
+            workshop.wire(Some(&part.step_pin), step_pin(axis.clone()));
+            workshop.wire(Some(&part.dir_pin), direction_pin(axis.clone()));
+            workshop.wire(part.endstop_pin.as_ref(), endstop_pin(axis.rail().clone()));
         }
         let boards = Boards(&config.mcus);
         let line = |pin: &PinName| (boards.of(&pin.name), local(&pin.name));
@@ -110,32 +109,32 @@ impl SimWorld {
             }
             let motors = config.axes.iter().zip(&workshop.world.axes).filter(|(other, _)| shares(other));
             let motors = motors.map(|(_, axis)| axis.clone()).collect();
-            workshop.wire(Some(pin), EnablePin(motors));
+            workshop.wire(Some(pin), enable_pin(motors));
         }
         for (part, rail) in config.carriages.iter().zip(workshop.world.carriages.clone()) {
-            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(rail));
+            workshop.wire(part.endstop_pin.as_ref(), endstop_pin(rail));
         }
         let extruders = printer.hot_ends().filter_map(|hot_end| workshop.axis(&hot_end.name));
         workshop.world.extruders = extruders.collect();
         for part in &config.heaters {
             let cooling_w_per_k = printer.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
             let heater = Arc::new(Heater::new(part, part.sensor()?, cooling_w_per_k, now));
-            workshop.wire(part.pin.as_ref(), HeaterPin(heater.clone()));
-            workshop.wire(part.sensor_pin.as_ref(), ThermistorPin(heater.clone()));
+            workshop.wire(part.pin.as_ref(), heater_pin(heater.clone()));
+            workshop.wire(part.sensor_pin.as_ref(), thermistor_pin(heater.clone()));
             workshop.world.heaters.push(heater);
         }
         for part in &config.fans {
             let cools = part.cools.as_ref().and_then(|heater| workshop.heater(heater));
             let fan = Arc::new(Fan::new(part, cools, now));
-            workshop.wire(Some(&part.pin), FanPin(fan.clone(), Switch::Power));
-            workshop.wire(part.enable_pin.as_ref(), FanPin(fan.clone(), Switch::Enable));
+            workshop.wire(Some(&part.pin), fan_pin(fan.clone()));
+            workshop.wire(part.enable_pin.as_ref(), fan_enable_pin(fan.clone()));
             workshop.wire(part.tachometer_pin.as_ref(), TachometerPin(fan.clone()));
             workshop.world.fans.push(fan);
         }
         let mut switched: Vec<(&PinName, Arc<Lamp>)> = Vec::new();
         let mut lamp = |workshop: &mut Workshop<'_>, name: &str, pin| {
             let lamp = Arc::new(Lamp::new(name));
-            workshop.wire(Some(pin), LampPin(lamp.clone()));
+            workshop.wire(Some(pin), lamp_pin(lamp.clone()));
             switched.push((pin, lamp.clone()));
             lamp
         };
@@ -151,10 +150,10 @@ impl SimWorld {
             workshop.world.lamps.push(lamp);
         }
         for part in &config.inputs {
-            workshop.wire(Some(&part.pin), FixedInput { name: part.name.clone(), on: part.level });
+            workshop.wire(Some(&part.pin), fixed_input(part.name.clone(), part.level));
         }
         for part in &config.analogs {
-            workshop.wire(Some(&part.pin), FixedAnalog { name: part.name.clone(), fraction: part.fraction });
+            workshop.wire(Some(&part.pin), fixed_analog(part.name.clone(), part.fraction));
         }
         for bus in &config.spi_buses {
             let bus = SpiBus::new(bus, |name| {

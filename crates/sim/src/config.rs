@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated printer's description: TOML in, checked values out.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::catalog::PartConfig;
@@ -110,27 +108,6 @@ impl SimConfig {
         Ok(config)
     }
 
-    /// The description as TOML.
-    ///
-    /// # Errors
-    ///
-    /// A number that TOML cannot hold.
-    pub fn to_toml(&self) -> Result<String, Trouble> {
-        toml::to_string(self).map_err(|error| Trouble::new(error.to_string()).remedy("please report it"))
-    }
-
-    /// The place of an axis, in millimeters or radians, with the nozzle at this place. `None` if the axis does not move the
-    /// nozzle, or the nozzle cannot be there.
-    pub fn axis_place(&self, axis: &str, nozzle_mm: [f64; 3]) -> Option<f64> {
-        let kinematics = self.printer().kinematics();
-        let rail = kinematics.rails().iter().position(|rail| *rail == axis)?;
-        let place = match kinematics.linkage() {
-            Some(linkage) => linkage.places(nozzle_mm)[rail],
-            None => nozzle_mm[rail],
-        };
-        place.is_finite().then_some(place)
-    }
-
     /// Whether the motor of this axis moves more than the axis, for example a belt of a CoreXY printer. Alone it homes no
     /// axis.
     pub fn is_on_belts(&self, axis: &str) -> bool {
@@ -184,7 +161,9 @@ impl SimConfig {
     fn validate_part(&self, part: &dyn Part, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
         let whose = &format!("part `{}`", part.name());
         if self.parts.iter().filter(|other| other.part().name() == part.name()).count() > 1 {
-            return Err(Trouble::new("there are two of it").remedy("remove one, or tell them apart").of(whose));
+            return Err(Trouble::new("there are two of it")
+                .remedy("remove one, or give them different names")
+                .of(whose));
         }
         part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
         part.uart_pins().into_iter().try_for_each(|(key, pin)| pins.claim_for(Some("UART"), whose, key, pin))?;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer.cfg that matches a simulated printer.
 
-#![forbid(unsafe_code)]
-
 use super::config::SimConfig;
 use super::description::axes::{AxisConfig, DeltaConfig, End};
 use super::description::heater::{FanConfig, HeaterConfig};
@@ -26,7 +24,7 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.comment("");
     cfg.comment("Any section but [mcu], [printer] and the steppers may be taken out, with those that say that");
     cfg.comment(
-        "they need it. Sections with a # before each line are offered: the words before tell what they replace.",
+        "they need it. Sections with a # before each line are offered: the words before say what they replace.",
     );
     cfg.section("mcu");
     cfg.key("serial", pty);

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A person's view of a simulated printer.
 
-#![forbid(unsafe_code)]
-
 use std::fs::File;
 use std::sync::Arc;
 

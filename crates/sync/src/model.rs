@@ -145,12 +145,12 @@ fn words_are_as_new_as_the_message_about_them() {
     model(
         "together: a message",
         || (Seqlock::of(&[0; 2]), words::<1>()),
-        |(words, told)| {
+        |(words, flag)| {
             words.store([1; 2]);
-            told[0].store(1, Ordering::Release);
+            flag[0].store(1, Ordering::Release);
         },
-        |(words, told)| (told[0].load(Ordering::Acquire), words.load(|words| words.collect::<Vec<_>>())),
-        |_, (), (told, words)| assert!(told == 0 || words == [1; 2], "{words:?}"),
+        |(words, flag)| (flag[0].load(Ordering::Acquire), words.load(|words| words.collect::<Vec<_>>())),
+        |_, (), (flag, words)| assert!(flag == 0 || words == [1; 2], "{words:?}"),
     );
 }
 

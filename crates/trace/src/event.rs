@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Events of a recording: what happened, in 16 bytes with its time.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_protocol::block::Refusal;
 

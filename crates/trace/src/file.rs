@@ -4,8 +4,6 @@
 //! The file is compressed by gzip. It begins with a line [`MAGIC`], and a line of JSON, the [`Head`]. Each thread
 //! follows with a line of JSON ([`Part`]) and its events, 16 bytes each, as little-endian words.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 

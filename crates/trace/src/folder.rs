@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The folders that hold the files of traces, the names of these files, and which files stay.
 
-#![forbid(unsafe_code)]
-
 use std::env;
 use std::fs;
 use std::io;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace as a person sees it: what each thread did, from when to when, in words. All exports are made from it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, HashMap};
 
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};

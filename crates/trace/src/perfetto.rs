@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace for ui.perfetto.dev, in Chrome's JSON format ("Trace Event Format").
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Write};
 
 use serde::Serialize;

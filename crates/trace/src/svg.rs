@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A picture of a trace's end: what each thread did in the last 200 ms, and the verdict.
 
-#![forbid(unsafe_code)]
-
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::fmt::{Arguments, Write as _};

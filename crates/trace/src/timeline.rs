@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace as text for a person: one line for each thing of note. Between them, one line for all else that a thread did.
 
-#![forbid(unsafe_code)]
-
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -323,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_last_part_is_told() {
+    fn only_the_last_part_is_reported() {
         let text = text(|out| write(&late_host(), Duration::from_millis(20), out));
         assert_eq!(text.lines().nth(1).map(|line| &line[..6]), Some("-20.00"));
         assert!(text.contains("the MCU stopped in block 93"), "{text}");

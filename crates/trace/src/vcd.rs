@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A trace as the signals of a logic analyzer: VCD (IEEE 1364) for PulseView and GTKWave.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
 
@@ -272,7 +270,7 @@ mod tests {
     fn read_by_sigrok(vcd: &str) -> Option<HashMap<String, Vec<(u64, char)>>> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), vcd).unwrap();
-        // It writes what it has read as a VCD of its own.
+        // It writes the signals that it has read as another VCD.
         let output = Command::new("sigrok-cli").args(["-I", "vcd", "-O", "vcd", "-i"]).arg(file.path()).output();
         let Ok(output) = output else {
             // Past the test harness, which captures the output of tests.

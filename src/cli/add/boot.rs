@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The boot loader's settings: which line of config.txt, or which overlay, enables a bus.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 
-use super::catalog::Bus;
-use super::change::Splice;
+use super::board::Bus;
+use super::splice::Splice;
 
 /// The values with which config.txt switches a parameter on. None is also one.
 const ON: [&str; 4] = ["on", "true", "yes", "1"];
@@ -271,20 +269,20 @@ mod tests {
     fn an_overlay_joins_the_others_in_the_line_that_counts() {
         let new = &["sun50i-h616-spidev1_1", "sun50i-h616-spi-spidev"];
         let head = "bootlogo=true\noverlay_prefix=sun50i-h616\n";
-        let told = |rest: &str| cb1(&format!("{head}{rest}"), new).map(|text| text[head.len()..].to_owned());
+        let after = |rest: &str| cb1(&format!("{head}{rest}"), new).map(|text| text[head.len()..].to_owned());
         assert_eq!(
-            told("overlays=ws2812 light\nrootdev=UUID=1\n").unwrap(),
+            after("overlays=ws2812 light\nrootdev=UUID=1\n").unwrap(),
             "overlays=ws2812 light spidev1_1\nrootdev=UUID=1\n"
         );
-        assert_eq!(told("overlays=a\noverlays=b\n").unwrap(), "overlays=a\noverlays=b spidev1_1\n");
-        assert_eq!(told("#overlays=a\n").unwrap(), "#overlays=a\noverlays=spidev1_1\n");
-        assert_eq!(told("rootdev=1").unwrap(), "rootdev=1\noverlays=spidev1_1\n");
-        assert_eq!(told("overlays=\r\nx=y\r\n").unwrap(), "overlays=spidev1_1\r\nx=y\r\n");
-        assert_eq!(told("overlays= ").unwrap(), "overlays=spidev1_1 ");
+        assert_eq!(after("overlays=a\noverlays=b\n").unwrap(), "overlays=a\noverlays=b spidev1_1\n");
+        assert_eq!(after("#overlays=a\n").unwrap(), "#overlays=a\noverlays=spidev1_1\n");
+        assert_eq!(after("rootdev=1").unwrap(), "rootdev=1\noverlays=spidev1_1\n");
+        assert_eq!(after("overlays=\r\nx=y\r\n").unwrap(), "overlays=spidev1_1\r\nx=y\r\n");
+        assert_eq!(after("overlays= ").unwrap(), "overlays=spidev1_1 ");
         for on in ["overlays=x spidev1_1\n", "overlays=sun50i-h616-spidev1_1\n"] {
-            assert_eq!(told(on).unwrap(), on);
+            assert_eq!(after(on).unwrap(), on);
         }
-        let error = told("overlays=mcp2515\n").unwrap_err();
+        let error = after("overlays=mcp2515\n").unwrap_err();
         assert_eq!(error, "the overlay mcp2515 uses spidev1.1 already: remove it from overlays=");
     }
 

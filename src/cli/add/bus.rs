@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The bus of a device: whether it is there, and the changes at boot that enable it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::catalog::{Boot, Bus, Device, Kind, KnownBoard};
-use super::change::{Change, Record, Splice};
+use super::board::{Boot, Bus, KnownBoard};
+use super::catalog::{Device, Kind};
+use super::change::{Change, Record};
 use super::printer::Printer;
+use super::splice::Splice;
 use super::{BUS, Work, boot, system};
 
 /// The file that loads the driver of /dev/i2c-*.

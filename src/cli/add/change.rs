@@ -8,104 +8,23 @@
 //! A change is a splice: the text that it has replaced, and the new text. So it can be taken back after others have
 //! changed the file elsewhere. The record of all splices of a device is written before the first of them is made.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
 
-use nix::unistd::{Gid, Uid, getegid, geteuid, getgroups, setegid, seteuid, setgroups};
+use nix::unistd::geteuid;
 use serde::{Deserialize, Serialize};
 
+use super::rights::Rights;
+use super::splice::Splice;
 use crate::cli::computer::Computer;
 use pinion_linux::foreign::{self, word};
 use pinion_linux::own_folder::OwnFolder;
 
 /// Longest file that is changed. A printer.cfg has some 100 kB at most.
 const BYTES_MAX: u64 = 4 << 20;
-
-/// A text that replaces another one at a place of a file.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Splice {
-    /// The first byte.
-    pub(super) at: usize,
-    pub(super) old: String,
-    pub(super) new: String,
-    /// The word that `new`, a line of a key and words, has more than `old`. Only this word is taken back: others may
-    /// have come since.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) word: Option<String>,
-}
-
-impl Splice {
-    /// An insertion.
-    pub(super) fn insert(at: usize, new: String) -> Splice {
-        Splice { at, old: String::new(), new, word: None }
-    }
-
-    /// Makes the change in the text that it was planned for.
-    pub(super) fn apply(&self, text: &mut String) {
-        text.replace_range(self.at..self.at + self.old.len(), &self.new);
-    }
-
-    /// Takes the change back, also if the text has changed elsewhere. False if it is not in the text.
-    ///
-    /// # Errors
-    ///
-    /// The new text is there several times, and which one is ours cannot be known.
-    pub(super) fn revert(&self, text: &mut String) -> Result<bool, String> {
-        if let (Some(word), Some((key, _))) = (&self.word, self.new.split_once('=')) {
-            return Ok(remove_word(text, key, word));
-        }
-        let is_whole_line = |at: usize| at == 0 || self.new.starts_with(['\r', '\n']) || text[..at].ends_with('\n');
-        let at = if text.get(self.at..).is_some_and(|rest| rest.starts_with(&self.new)) {
-            self.at
-        } else {
-            let mut found = text.match_indices(&self.new).map(|(at, _)| at).filter(|at| is_whole_line(*at));
-            match (found.next(), found.next()) {
-                (None, _) => return Ok(false),
-                (Some(at), None) => at,
-                _ => return Err(format!("\"{}\" is there several times: remove the right one", self.new.trim())),
-            }
-        };
-        // The last line had no end, and others have written behind ours since: their line stays one of its own.
-        let line_end = self.new.len() - self.new.trim_start_matches(['\r', '\n']).len();
-        let has_more = at + self.new.len() < text.len();
-        let kept = if has_more { line_end } else { 0 };
-        text.replace_range(at + kept..at + self.new.len(), &self.old);
-        Ok(true)
-    }
-}
-
-/// Removes a word, with the space before it, from the last line with this key that has it. False if there is none.
-fn remove_word(text: &mut String, key: &str, word: &str) -> bool {
-    let mut line_at = 0;
-    let mut found = None;
-    for line in text.split_inclusive('\n') {
-        if let Some(words) = line.strip_prefix(key).and_then(|rest| rest.strip_prefix('=')) {
-            let is_end = |rest: Option<char>| rest.is_none_or(char::is_whitespace);
-            let is_word = |at: &usize| {
-                is_end(words[..*at].chars().next_back()) && is_end(words[*at + word.len()..].chars().next())
-            };
-            let at = words.match_indices(word).map(|(at, _)| at).find(is_word);
-            found = at.map(|at| line_at + key.len() + 1 + at).or(found);
-        }
-        line_at += line.len();
-    }
-    let Some(at) = found else { return false };
-    let end = at + word.len();
-    let is_before_another =
-        text[end..].strip_prefix(' ').is_some_and(|rest| rest.starts_with(|c: char| !c.is_whitespace()));
-    let (at, end) = match (text[..at].ends_with(' '), is_before_another) {
-        (true, _) => (at - 1, end),
-        (false, true) => (at, end + 1),
-        (false, false) => (at, end),
-    };
-    text.replace_range(at..end, "");
-    true
-}
 
 /// A change of one file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -139,35 +58,6 @@ impl Record {
     }
 }
 
-/// The rights of a file's owner, for as long as this exists. Without root's rights it changes nothing.
-struct Rights(Option<(Uid, Gid, Vec<Gid>)>);
-
-impl Rights {
-    fn of(owner: Option<(u32, u32)>) -> io::Result<Rights> {
-        let Some((uid, gid)) = owner.filter(|(uid, _)| *uid != 0 && geteuid().is_root()) else {
-            return Ok(Rights(None));
-        };
-        let rights = Rights(Some((geteuid(), getegid(), getgroups()?)));
-        setgroups(&[Gid::from_raw(gid)])?;
-        setegid(Gid::from_raw(gid))?;
-        seteuid(Uid::from_raw(uid))?;
-        Ok(rights)
-    }
-}
-
-impl Drop for Rights {
-    fn drop(&mut self) {
-        let Some((uid, gid, groups)) = self.0.take() else { return };
-        let back = seteuid(uid).and_then(|()| setegid(gid)).and_then(|()| setgroups(&groups));
-        if let Err(error) = back {
-            // Nothing after this may run with a mixture of rights.
-            let _ = crate::cli::failed(format!("root's rights cannot be taken again: {error}: call this again"));
-            crate::cli::logging::finish();
-            std::process::exit(1);
-        }
-    }
-}
-
 /// A side of the computer where files are changed: root's, or that of printer.cfg's owner.
 pub(super) struct Side<'a> {
     pub(super) computer: &'a Computer,
@@ -184,11 +74,11 @@ impl Side<'_> {
     ///
     /// One line: a link or another kind of file is in its place, it is no text, or it cannot be read.
     pub(super) fn read(&self, file: &Path) -> Result<Option<String>, String> {
-        let _rights = Rights::of(self.owner).map_err(|error| told(file, &error))?;
+        let _rights = Rights::of(self.owner).map_err(|error| failed(file, &error))?;
         match self.folder(file, false) {
-            Ok((folder, name)) => read_in(&folder, &name).map_err(|error| told(file, &error)),
+            Ok((folder, name)) => read_in(&folder, &name).map_err(|error| failed(file, &error)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(told(file, &error)),
+            Err(error) => Err(failed(file, &error)),
         }
     }
 
@@ -207,12 +97,12 @@ impl Side<'_> {
             let (folder, name) = self.folder(file, true)?;
             replace(&folder, &name, text.as_bytes())
         };
-        write().map_err(|error: io::Error| told(file, &error))
+        write().map_err(|error: io::Error| failed(file, &error))
     }
 
     /// Fails if somebody has protected the file: a rename would replace it all the same.
     fn refuse_read_only(&self, file: &Path) -> Result<(), String> {
-        let _rights = Rights::of(self.owner).map_err(|error| told(file, &error))?;
+        let _rights = Rights::of(self.owner).map_err(|error| failed(file, &error))?;
         match fs::symlink_metadata(self.computer.path(file)) {
             Ok(about) if about.mode() & 0o200 == 0 => {
                 let path = file.display();
@@ -228,7 +118,7 @@ impl Side<'_> {
             let (folder, name) = self.folder(file, false)?;
             fs::remove_file(folder.at(name))
         };
-        remove().map_err(|error: io::Error| told(file, &error))
+        remove().map_err(|error: io::Error| failed(file, &error))
     }
 
     /// Removes a folder that has become empty.
@@ -443,7 +333,7 @@ fn replace(folder: &OwnFolder, name: &str, bytes: &[u8]) -> io::Result<()> {
     put().inspect_err(|_| drop(fs::remove_file(folder.at(&fresh))))
 }
 
-fn told(file: &Path, error: &io::Error) -> String {
+fn failed(file: &Path, error: &io::Error) -> String {
     let remedy = match error.kind() {
         io::ErrorKind::PermissionDenied if !geteuid().is_root() => ": call it with sudo",
         io::ErrorKind::PermissionDenied => {

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Asks the device, before anything is written to printer.cfg.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
@@ -11,7 +9,8 @@ use crate::cli::computer::{Access, Computer};
 use crate::cli::quietly;
 
 use super::Work;
-use super::catalog::{Check, KnownBoard, Spot};
+use super::board::{KnownBoard, Spot};
+use super::catalog::Check;
 use super::printer::Printer;
 use super::probe::{self, Answer};
 

@@ -1,13 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion add` without a device: what can be added here.
 
-#![forbid(unsafe_code)]
-
 use serde_json::{Value, json};
 
 use crate::cli::page::aligned;
 
-use super::catalog::{Catalog, Device, KnownBoard};
+use super::board::KnownBoard;
+use super::catalog::{Catalog, Device};
 use super::report::Report;
 
 /// Lists the devices.

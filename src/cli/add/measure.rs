@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Restarts the host, and asks it for a device's first value.
 
-#![forbid(unsafe_code)]
-
 use std::thread;
 use std::time::{Duration, Instant};
 

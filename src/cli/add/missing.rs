@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The finding of `pinion doctor`: devices in printer.cfg whose bus is not there.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 

@@ -5,8 +5,6 @@
 //! restart, and measures. A call that ends at a reboot or at a wrong wire goes on when it is repeated: each step first
 //! checks if it is done.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::io::{self, BufRead as _, IsTerminal as _};
 use std::path::PathBuf;
@@ -22,6 +20,7 @@ use super::files::Output;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::process::Process;
 
+mod board;
 mod boot;
 mod bus;
 mod catalog;
@@ -35,10 +34,13 @@ mod picture;
 mod printer;
 mod probe;
 mod report;
+mod rights;
+mod splice;
 mod undo;
 
+use board::{KnownBoard, Spot, Wire};
 use bus::State;
-use catalog::{Catalog, Device, Kind, KnownBoard, Spot, Way, Wire};
+use catalog::{Catalog, Device, Kind, Way};
 use change::{Change, Record, Side, copy_of};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};

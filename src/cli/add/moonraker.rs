@@ -3,8 +3,6 @@
 //!
 //! A request is one connection of HTTP/1.0, so its answer ends with the connection. No library does less than this.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::thread;
@@ -112,11 +110,11 @@ impl Moonraker<'_> {
             let time = |entry: &Value| entry["time"].as_f64().unwrap_or(0.0);
             answers.filter_map(|entry| Some((time(entry), entry["message"].as_str()?.to_owned()))).collect()
         };
-        let told = || self.ask("GET", "/server/gcode_store?count=50").map(|store| lines(&store));
-        let before = told().map_err(|refused| refused.why)?;
+        let stored = || self.ask("GET", "/server/gcode_store?count=50").map(|store| lines(&store));
+        let before = stored().map_err(|refused| refused.why)?;
         let run = format!("/printer/gcode/script?script={}", encoded(command));
         self.ask("POST", &run).map_err(|refused| refused.why)?;
-        let after = told().map_err(|refused| refused.why)?;
+        let after = stored().map_err(|refused| refused.why)?;
         Ok(after.into_iter().filter(|line| !before.contains(line)).map(|(_, line)| line).collect())
     }
 

@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The header of a board with the wires to make, in the terminal and as SVG.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::page::{Page, aligned};
 use pinion_linux::foreign::plain_xml;
 
-use super::catalog::{KnownBoard, Wire};
+use super::board::{KnownBoard, Wire};
 
 /// A table of the wires, and the header with them.
 pub(super) fn page(board: &KnownBoard, wires: &[Wire]) -> Page {

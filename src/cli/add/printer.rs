@@ -4,8 +4,6 @@
 //! A device has a file of its own in the folder `pinion` beside printer.cfg, and all of them share one
 //! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::os::unix::fs::MetadataExt;
@@ -21,7 +19,8 @@ use pinion_linux::foreign::word;
 use pinion_runtime::klippy::HOST_PATHS;
 
 use super::catalog::{Device, Kind};
-use super::change::{Change, Side, Splice};
+use super::change::{Change, Side};
+use super::splice::Splice;
 
 /// Where klippy's configuration is if no klippy runs or is set up.
 const USUAL: [&str; 3] =

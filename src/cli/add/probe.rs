@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Asks a device over its bus whether it is there, and explains a wrong answer.
 
-#![forbid(unsafe_code)]
-
 use std::thread;
 use std::time::Duration;
 

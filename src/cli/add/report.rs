@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The output of `pinion add`.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Display;
 
 use serde_json::{Value, json};

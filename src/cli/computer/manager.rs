@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The settings of systemd itself, from the running one and from its files.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
@@ -119,8 +117,8 @@ mod tests {
         }
         // The remedy, before systemd has read it, and after.
         tree.put("etc/systemd/system.conf.d/99-pinion.conf", "[Manager]\nRuntimeWatchdogSec=off\n");
-        let (told, remedy) = found(&tree, Some("RuntimeWatchdogUSec=1min"));
-        assert!(told.ends_with("RuntimeWatchdogUSec=1min in the running one"), "{told}");
+        let (words, remedy) = found(&tree, Some("RuntimeWatchdogUSec=1min"));
+        assert!(words.ends_with("RuntimeWatchdogUSec=1min in the running one"), "{words}");
         assert!(remedy.starts_with("sudo systemctl daemon-reexec; or watchdog = false"), "{remedy}");
         assert_eq!(found(&tree, Some("RuntimeWatchdogUSec=0")).0, "");
         assert_eq!(found(&tree, None).0, "");
@@ -140,8 +138,8 @@ mod tests {
         assert_eq!(found(&tree, None).0, "", "a file of the same name hides it");
         // The name of the remedy comes after any.
         tree.put("etc/systemd/system.conf.d/zz.conf", "RuntimeWatchdogSec=default\n");
-        let (told, remedy) = found(&tree, None);
-        assert!(told.ends_with("RuntimeWatchdogSec=default in /etc/systemd/system.conf.d/zz.conf"), "{told}");
+        let (words, remedy) = found(&tree, None);
+        assert!(words.ends_with("RuntimeWatchdogSec=default in /etc/systemd/system.conf.d/zz.conf"), "{words}");
         assert!(remedy.contains("/system.conf.d/zz.pinion.conf && "), "{remedy}");
         tree.put("etc/systemd/system.conf.d/zz.pinion.conf", "RuntimeWatchdogSec=off\n");
         assert_eq!(found(&tree, None).0, "");

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The processes of the computer: their users, the units that started them, and the Pinions among them.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsString;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -327,8 +325,8 @@ mod tests {
         tree.put("proc/7/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
         tree.process(7, &["pinion"], MALLORY, &[]);
         assert_eq!(print_at_risk(&tree.computer()), None);
-        let told = print_of_another(&tree.computer()).unwrap();
-        assert!(told.starts_with("process 7 may be a Pinion of another user"), "{told}");
+        let line = print_of_another(&tree.computer()).unwrap();
+        assert!(line.starts_with("process 7 may be a Pinion of another user"), "{line}");
         tree.process(7, &["pinion"], 0, &[]);
         assert!(print_at_risk(&tree.computer()).is_some());
         assert_eq!(print_of_another(&tree.computer()), None);

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Pins and buses: whether they are there, and whether Pinion may open them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::FileTypeExt;
@@ -298,7 +296,7 @@ pub(super) fn is_rp1(computer: &Computer) -> bool {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::boards;
     use crate::cli::computer::tests::Tree;
@@ -336,10 +334,10 @@ mod tests {
         tree.put("etc/pinion/pinion.toml", "watchdog = true\nfast_gpio = \"on\"\n");
         let findings = permitted(&tree, &stranger(vec![gid]));
         assert_eq!(findings.len(), NODES.len());
-        NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Fine, "pinion may open /")));
+        NODES.iter().for_each(|(check, _)| drop(says(&findings, check, Fine, "pinion may open /")));
         let findings = permitted(&tree, &stranger(vec![gid + 1]));
         for (check, path) in NODES {
-            let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
+            let remedy = says(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
             assert_eq!(remedy, "sudo usermod -aG gpio pinion, then sudo systemctl restart pinion-mcu");
         }
     }
@@ -351,10 +349,10 @@ mod tests {
             tree.put("etc/pinion/pinion.toml", format!("fast_gpio = \"{wish}\"\n"));
             permitted(&tree, &stranger(vec![]))
         };
-        let remedy = told(&wish("on"), "fast_gpio", Warning, "there is no /dev/gpiomem");
+        let remedy = says(&wish("on"), "fast_gpio", Warning, "there is no /dev/gpiomem");
         assert!(remedy.starts_with("only Raspberry Pi's own kernel has this node"), "{remedy}");
         assert_eq!(
-            told(&wish("/dev/mem"), "fast_gpio", Warning, "pinion may not open /dev/mem"),
+            says(&wish("/dev/mem"), "fast_gpio", Warning, "pinion may not open /dev/mem"),
             "set fast_gpio to on, or run Pinion as root"
         );
         assert_eq!(wish("auto"), [], "nobody asked for it");
@@ -370,10 +368,10 @@ mod tests {
             permitted(&tree, &stranger(vec![]))
         };
         let remedy =
-            told(&with_policy("[default] performance\n"), "fast_gpio", Warning, "the PCIe link of the RP1 may");
+            says(&with_policy("[default] performance\n"), "fast_gpio", Warning, "the PCIe link of the RP1 may");
         assert!(remedy.contains("pcie_aspm.policy=performance, and not pcie_aspm=off"), "{remedy}");
         let findings = with_policy("default [performance] powersave\n");
-        told(&findings, "fast_gpio", Fine, "may open /dev/gpiomem0");
+        says(&findings, "fast_gpio", Fine, "may open /dev/gpiomem0");
         assert_eq!(findings.len(), 1, "{findings:?}");
     }
 
@@ -381,17 +379,17 @@ mod tests {
     fn the_users_are_judged_that_pinion_runs_as() {
         let tree = Tree::new();
         let look = || permissions(&tree.computer(), &instances(&tree.called_by(54_321)).0, &BTreeSet::new());
-        assert_eq!(told(&look(), "user", Warning, "there is no user pinion"), INSTALL);
+        assert_eq!(says(&look(), "user", Warning, "there is no user pinion"), INSTALL);
         tree.put_mode("dev/gpiochip0", "", 0o660);
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
         let passwd = "root:x:0:0:::\npinion:x:54321:54321:::\npi:x:54322:54322:::\n";
         tree.put("etc/passwd", passwd);
         tree.put("etc/group", format!("gpio:x:{gid}:pi\n"));
         // The service would run as pinion.
-        told(&look(), "gpio", Error, "pinion may not open");
+        says(&look(), "gpio", Error, "pinion may not open");
         // A running process counts, with its groups.
         tree.process(10, &["/usr/bin/pinion", "run"], 54_321, &[gid]);
-        told(&look(), "gpio", Fine, "pinion may open");
+        says(&look(), "gpio", Fine, "pinion may open");
         // A stranger's does not.
         tree.process(9, &["/usr/bin/pinion", "run"], 54_322, &[]);
         assert_eq!(look().len(), 1, "{:?}", look());
@@ -400,20 +398,20 @@ mod tests {
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
         let findings = look();
         assert_eq!(findings.len(), 2, "{findings:?}");
-        told(&findings, "gpio", Fine, "pi may open");
+        says(&findings, "gpio", Fine, "pi may open");
         tree.put("etc/group", format!("gpio:x:{gid}:\n"));
-        let remedy = told(&look(), "gpio", Error, "pi may not open");
+        let remedy = says(&look(), "gpio", Error, "pi may not open");
         assert_eq!(remedy, "sudo usermod -aG gpio pi, then sudo systemctl restart klipper-mcu");
         let unit = "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\nSupplementaryGroups=gpio\n";
         tree.put("etc/systemd/system/klipper-mcu.service", unit);
-        told(&look(), "gpio", Fine, "pi may open");
+        says(&look(), "gpio", Fine, "pi may open");
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
-        told(&look(), "gpio", Fine, "root may open");
+        says(&look(), "gpio", Fine, "root may open");
         // The simulated printer opens nothing.
         fs::remove_file(tree.computer().path("/etc/systemd/system/multi-user.target.wants/klipper-mcu.service"))
             .unwrap();
         tree.process(10, &["/usr/bin/pinion", "run", "--board", "sim"], 54_321, &[]);
-        told(&look(), "user", Warning, "there is no user pinion");
+        says(&look(), "user", Warning, "there is no user pinion");
     }
 
     /// A link to a device of this computer, in the place of a node: a test cannot make nodes.
@@ -421,14 +419,14 @@ mod tests {
     fn a_node_of_another_kind_is_no_chip() {
         let tree = Tree::new();
         tree.link("dev/gpiochip0", "/dev/null");
-        told(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        says(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
         tree.link("sys/dev/char/1:3/subsystem", "../../../../class/mem");
         let remedy =
-            told(&presence(&tree.computer()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
+            says(&presence(&tree.computer()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
         assert!(remedy.starts_with("sudo rm /dev/gpiochip0 && sudo udevadm trigger"), "{remedy}");
         fs::remove_file(tree.computer().path("/sys/dev/char/1:3/subsystem")).unwrap();
         tree.link("sys/dev/char/1:3/subsystem", "../../../../bus/gpio");
-        told(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        says(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
     }
 
     #[test]
@@ -436,9 +434,9 @@ mod tests {
         let tree = Tree::new();
         tree.put_mode("dev/spidev0.0", "", 0o600);
         let find = || permitted(&tree, &stranger(vec![]));
-        assert!(told(&find(), "spi", Error, "0600 (1 of 1 refused)").contains("apt install --reinstall"));
+        assert!(says(&find(), "spi", Error, "0600 (1 of 1 refused)").contains("apt install --reinstall"));
         tree.put("usr/lib/udev/rules.d/60-pinion-mcu.rules", "");
-        assert!(told(&find(), "spi", Error, "may not open").ends_with("--subsystem-match=spidev"));
+        assert!(says(&find(), "spi", Error, "may not open").ends_with("--subsystem-match=spidev"));
         assert_eq!(find().len(), 1, "nothing is said of what is not there");
     }
 
@@ -446,32 +444,32 @@ mod tests {
     fn what_is_there_and_how_to_enable_the_rest() {
         let tree = Tree::new();
         let findings = presence(&tree.computer());
-        told(&findings, "gpio", Warning, "no GPIO chip");
-        assert!(told(&findings, "spi", Fine, "SPI: none").contains("device tree"));
+        says(&findings, "gpio", Warning, "no GPIO chip");
+        assert!(says(&findings, "spi", Fine, "SPI: none").contains("device tree"));
         tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
         tree.put("boot/firmware/config.txt", "#dtparam=spi=on\ndtparam=i2c_arm=on\ndtoverlay=w1-gpio\n");
         let findings = presence(&tree.computer());
-        let remedy = told(&findings, "spi", Fine, "SPI: off");
+        let remedy = says(&findings, "spi", Fine, "SPI: off");
         assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
-        assert_eq!(told(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
-        told(&findings, "w1", Warning, "no DS18B20 answers");
-        assert!(told(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
+        assert_eq!(says(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
+        says(&findings, "w1", Warning, "no DS18B20 answers");
+        assert!(says(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
         tree.put("sys/bus/i2c/devices/i2c-1/name", "");
-        assert!(told(&presence(&tree.computer()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
+        assert!(says(&presence(&tree.computer()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
         let findings = presence(&tree.computer());
         assert!(
             findings.iter().all(|finding| finding.status == Fine && finding.trouble.remedy.is_none()),
             "{findings:?}"
         );
-        told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
+        says(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
     }
 
     #[test]
     fn only_a_raspberry_pi_has_a_config_txt() {
         for board in [boards::cb1(), boards::rk3566()] {
             let findings = presence(&board.tree().computer());
-            told(&findings, "gpio", Fine, "GPIO: /dev/gpiochip0 and ");
+            says(&findings, "gpio", Fine, "GPIO: /dev/gpiochip0 and ");
             for finding in findings {
                 assert_eq!(finding.status, Fine, "{finding:?}");
                 let text = format!("{finding:?}");
@@ -479,7 +477,7 @@ mod tests {
             }
         }
         for board in boards::all() {
-            told(&presence(&board.tree().computer()), "gpio", Fine, "GPIO: /dev/gpiochip");
+            says(&presence(&board.tree().computer()), "gpio", Fine, "GPIO: /dev/gpiochip");
         }
     }
 }

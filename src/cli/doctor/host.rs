@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host: which klippys there are, and whether Pinion speaks their messages.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -233,7 +231,7 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
@@ -282,10 +280,10 @@ mod tests {
             let computer = tree.computer();
             dialects(&computer, &instances(&computer).0, &klippys(&computer))
         };
-        told(&look(), "dialect", Ok, "which host comes is unknown");
+        says(&look(), "dialect", Ok, "which host comes is unknown");
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
-        told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
+        says(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
         let commands = FEATURES.iter().flat_map(|feature| feature.commands);
         let responses = FEATURES.iter().flat_map(|feature| feature.responses);
         let formats = commands.map(|one| (one.format, one.dialects));
@@ -301,16 +299,16 @@ mod tests {
             })
             .collect();
         tree.put("home/pi/klipper/klippy/mcu.py", forms.concat());
-        told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
+        says(&look(), "dialect", Ok, "it is served in the dialect v0.12");
         let speak = |name: &str| tree.put("etc/pinion/pinion.toml", format!("dialect = \"{name}\"\n"));
         speak("v0.12");
-        told(&look(), "dialect", Ok, "as configured");
+        says(&look(), "dialect", Ok, "as configured");
         speak("kalico");
-        told(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion's configuration says kalico");
+        says(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion's configuration says kalico");
         // This klippy is another instance's host.
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
-        told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
+        says(&look(), "dialect", Ok, "it is served in the dialect v0.12");
         tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_adxl345 oid=%c wings=%u\")\n");
-        told(&look(), "dialect", Error, "query_adxl345 oid wings");
+        says(&look(), "dialect", Error, "query_adxl345 oid wings");
     }
 }

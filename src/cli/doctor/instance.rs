@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The instances of Pinion: the running ones, and those whose units are enabled.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 
 use crate::cli::computer::running::{Running, named_config};
@@ -247,7 +245,7 @@ fn options(computer: &Computer, file: &str) -> Result<Given, String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok};
@@ -269,12 +267,12 @@ mod tests {
         );
         let (Instance { settings, .. }, findings) = read();
         assert_eq!((settings.cpu, settings.watchdog, settings.access.mode), (Some(3), true, 0o660));
-        told(&findings, "config", Ok, "has no mistake");
+        says(&findings, "config", Ok, "has no mistake");
         tree.put("etc/pinion/pinion.toml", "\ncpus = 2\n");
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux 3\"\n");
         let (_, findings) = read();
-        told(&findings, "config", Error, "/etc/pinion/pinion.toml:2:1: cpus: there is no such key: did you mean cpu?");
-        told(&findings, "options", Error, "/etc/default/pinion-mcu: unexpected argument '--cpux' found");
+        says(&findings, "config", Error, "/etc/pinion/pinion.toml:2:1: cpus: there is no such key: did you mean cpu?");
+        says(&findings, "options", Error, "/etc/default/pinion-mcu: unexpected argument '--cpux' found");
         tree.process(9, &["/usr/bin/pinion", "run", "--cpu", "1"], 0, &[]);
         assert_eq!(read().0.settings.cpu, Some(1), "what runs counts");
     }
@@ -292,11 +290,11 @@ mod tests {
         assert_eq!(names, ["pinion-mcu", "pinion-mcu@second"]);
         assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_mcu")));
         assert_eq!(found[1].link.as_deref(), Some(Path::new("/tmp/klipper_host_second")));
-        let remedy = told(&findings, "config", Error, "/etc/pinion/second.toml:2:1: margn_us");
+        let remedy = says(&findings, "config", Error, "/etc/pinion/second.toml:2:1: margn_us");
         assert_eq!(remedy, "sudo nano /etc/pinion/second.toml, then sudo systemctl restart pinion-mcu@second");
         fs::remove_file(tree.computer().path("/etc/pinion/second.toml")).unwrap();
         let (_, findings) = instances(&tree.computer());
-        let remedy = told(&findings, "config", Error, "there is no /etc/pinion/second.toml");
+        let remedy = says(&findings, "config", Error, "there is no /etc/pinion/second.toml");
         assert!(remedy.starts_with("sudo cp /etc/pinion/pinion.toml /etc/pinion/second.toml"), "{remedy}");
         // For a running instance the process counts. Its guardian is no instance.
         tree.put("etc/pinion/second.toml", "cpu = 3\n");

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The kernel: whether it is built and set up for real time.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
@@ -184,7 +182,7 @@ fn governor(computer: &Computer) -> Option<Finding> {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
@@ -206,12 +204,12 @@ mod tests {
         let findings = found(&tree, Some(4));
         assert!(findings.len() == 5 && findings.iter().all(|finding| finding.status == Ok), "{findings:?}");
         tree.put("proc/version", "Linux version 5.15.0 #1 SMP PREEMPT RT\n");
-        told(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
+        says(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
         tree.put("proc/version", "Linux\n");
         tree.put("sys/kernel/realtime", "1\n");
-        told(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
+        says(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
         tree.put("proc/sys/kernel/sched_rt_runtime_us", "-1\n");
-        told(&found(&tree, Some(4)), "rt_throttling", Ok, "does not throttle");
+        says(&found(&tree, Some(4)), "rt_throttling", Ok, "does not throttle");
     }
 
     #[test]
@@ -225,22 +223,22 @@ mod tests {
         tree.put("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "ondemand\n");
         tree.put("sys/devices/system/cpu/cpu1/cpufreq/scaling_governor", "performance\n");
         let findings = found(&tree, None);
-        let rt = told(&findings, "preempt_rt", Warning, "6.1.0-rpi4-rpi-v8 is not PREEMPT_RT");
+        let rt = says(&findings, "preempt_rt", Warning, "6.1.0-rpi4-rpi-v8 is not PREEMPT_RT");
         assert!(rt.starts_with("sudo apt install linux-image-rpi-v8-rt"), "{rt}");
-        told(&findings, "rt_throttling", Error, "no real time");
-        assert_eq!(told(&findings, "isolated_cpus", Warning, "nobody uses"), "cpu = 3 in /etc/pinion/pinion.toml");
-        told(&findings, "governor", Warning, "is ondemand:");
+        says(&findings, "rt_throttling", Error, "no real time");
+        assert_eq!(says(&findings, "isolated_cpus", Warning, "nobody uses"), "cpu = 3 in /etc/pinion/pinion.toml");
+        says(&findings, "governor", Warning, "is ondemand:");
         tree.put("proc/sys/kernel/sched_rt_runtime_us", "100000\n");
-        told(&found(&tree, Some(2)), "rt_throttling", Warning, "100000 of 1000000");
-        told(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
+        says(&found(&tree, Some(2)), "rt_throttling", Warning, "100000 of 1000000");
+        says(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
         tree.put("sys/devices/system/cpu/isolated", "\n");
-        assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+        assert!(says(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
         tree.put("sys/devices/system/cpu/present", "0-3\n");
-        assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+        assert!(says(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
         // A processor that is not there cannot be isolated either.
         for isolated in ["", "99", "2-3"] {
             tree.put("sys/devices/system/cpu/isolated", isolated);
-            let remedy = told(&found(&tree, Some(99)), "isolated_cpus", Error, "99, which is not there");
+            let remedy = says(&found(&tree, Some(99)), "isolated_cpus", Error, "99, which is not there");
             assert_eq!(remedy, "cpu = 3 in /etc/pinion/pinion.toml");
         }
     }
@@ -258,10 +256,10 @@ mod tests {
             );
         }
         let findings = found(&tree, None);
-        told(&findings, "isolated_cpus", Ok, "process 10 stays on processor 2");
-        told(&findings, "isolated_cpus", Ok, "process 11 stays on processor 3");
+        says(&findings, "isolated_cpus", Ok, "process 10 stays on processor 2");
+        says(&findings, "isolated_cpus", Ok, "process 11 stays on processor 3");
         tree.process(11, &["/usr/bin/pinion", "run", "--cpu", "2", "-I", "/tmp/klipper_host_11"], 0, &[]);
-        told(&found(&tree, None), "isolated_cpus", Warning, "process 11 stays on processor 2, as another Pinion does");
+        says(&found(&tree, None), "isolated_cpus", Warning, "process 11 stays on processor 2, as another Pinion does");
     }
 
     #[test]
@@ -276,7 +274,7 @@ mod tests {
             ("6.12.25+rpt-rpi-v8", Ok, "has all"),
         ] {
             tree.put("proc/sys/kernel/osrelease", release);
-            told(&found(&tree, None), "kernel_version", status, words);
+            says(&found(&tree, None), "kernel_version", status, words);
         }
     }
 

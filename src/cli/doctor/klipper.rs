@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion doctor --klipper DIR`: whether this Pinion serves the host of a checkout.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::path::Path;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The newest recording: why the MCU stopped, and who was late.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io;
 use std::path::PathBuf;
@@ -38,12 +36,12 @@ pub(super) fn finding(computer: &Computer, now: SystemTime) -> Finding {
         Ok(trace) => trace,
         Err(error) => return Finding::ok(CHECK, format!("unknown: {} cannot be read: {error}", name.display())),
     };
-    let told = verdict(&trace);
-    let found = format!("{}: {}", utc_text(trace.head.utc_ms), told.text);
+    let judged = verdict(&trace);
+    let found = format!("{}: {}", utc_text(trace.head.utc_ms), judged.text);
     let at = UNIX_EPOCH + Duration::from_millis(trace.head.utc_ms);
     let is_recent = now.duration_since(at).is_ok_and(|age| age <= RECENT);
     let look = format!("pinion trace {}", word(name.display()));
-    match told.culprit {
+    match judged.culprit {
         Culprit::Nobody => Finding::ok(CHECK, found),
         _ if is_recent => Finding::warning(CHECK, found, look),
         _ => Finding::ok(CHECK, found).or(look),

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Whether LEDs on a data line of SPI, or on a fast line, get a clock that they understand.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
@@ -138,7 +136,7 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
@@ -168,7 +166,7 @@ mod tests {
             ("Raspberry Pi Zero 2 W Rev 1.0\0", &["core_freq=250\n"][..], &[""][..], "core_freq=250"),
         ] {
             for config in held {
-                told(
+                says(
                     &judged(model, config, "host:spidev0.0"),
                     "leds",
                     Fine,
@@ -178,14 +176,14 @@ mod tests {
             for config in loose {
                 let findings = judged(model, config, "host:spidev0.0");
                 assert!(
-                    told(&findings, "leds", Warning, "of host:spidev0.0 may be white").contains(remedy),
+                    says(&findings, "leds", Warning, "of host:spidev0.0 may be white").contains(remedy),
                     "{config}"
                 );
                 assert_eq!(findings.len(), 1);
             }
         }
         let findings = judged("Raspberry Pi 4", "force_turbo=1", "host:spidev1.0");
-        assert!(told(&findings, "leds", Warning, "of host:spidev1.0 has no DMA").contains("SPI0"));
+        assert!(says(&findings, "leds", Warning, "of host:spidev1.0 has no DMA").contains("SPI0"));
         assert!(judged("Raspberry Pi 5 Model B", "", "host:spidev0.0").is_empty(), "its SPI has a clock of its own");
         assert!(judged("Raspberry Pi 2", "", "host:spidev0.0").is_empty(), "its VPU has one clock");
         assert!(judged("Pine64", "", "host:spidev0.0").is_empty());
@@ -208,11 +206,11 @@ mod tests {
         let refused = |nodes: &[(&str, u32)], settings: &str, why: &str| {
             let findings = judged(nodes, settings, "host:gpio18");
             assert_eq!(findings.len(), 1, "{findings:?}");
-            told(&findings, "leds", Error, &format!("host:gpio18 is refused: {why}"))
+            says(&findings, "leds", Error, &format!("host:gpio18 is refused: {why}"))
         };
         let (pi_4, pi_5) = (("dev/gpiomem", 0o666), ("dev/gpiomem0", 0o666));
-        told(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
-        told(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
+        says(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
+        says(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
         assert!(refused(&[], "", "this computer has no fast lines").contains("spidev0.0"));
         assert!(refused(&[], "fast_gpio = \"off\"\n", "this computer has no fast lines").contains("spidev0.0"));
         assert!(

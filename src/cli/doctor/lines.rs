@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! GPIO lines: which ones the pins of a printer.cfg mean, and which processes hold them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
@@ -125,7 +123,7 @@ pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::boards::{self, TestBoard};
     use crate::cli::computer::tests::Tree;
@@ -141,7 +139,7 @@ mod tests {
     #[test]
     fn a_header_whose_chip_has_another_number() {
         let numbered = ["gpio17", "gpiochip4/gpio33"];
-        let remedy = told(
+        let remedy = says(
             &about_header(&boards::pi5(), &numbered),
             "gpio_numbers",
             Warning,
@@ -152,17 +150,17 @@ mod tests {
         for pins in [&[][..], &["gpiochip15/gpio17"], &["gpiochip11/gpio1"], &["gpio99"]] {
             let findings = about_header(&boards::pi5(), pins);
             assert!(findings.len() == 1 && findings[0].trouble.remedy.is_none(), "{findings:?}");
-            told(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
+            says(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
         }
         // gpio17 is a line of the processor's own chip there.
         let findings = about_header(&boards::pi5_debian(), &numbered);
-        let remedy = told(&findings, "gpio_numbers", Warning, "these pins are lines of another chip: gpio17");
+        let remedy = says(&findings, "gpio_numbers", Warning, "these pins are lines of another chip: gpio17");
         assert_eq!(remedy, "in printer.cfg write pinctrl-rp1/gpio17 for gpio17, if you mean lines of the header");
         assert_eq!(findings.len(), 1, "gpiochip4 is the header");
         let findings = about_header(&boards::pi5_without_header(), &[]);
-        assert!(told(&findings, "gpio_numbers", Warning, "no driver for the lines").contains("Raspberry Pi OS"));
-        told(&about_header(&boards::pi4(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2711)");
-        told(&about_header(&boards::zero2(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2835)");
+        assert!(says(&findings, "gpio_numbers", Warning, "no driver for the lines").contains("Raspberry Pi OS"));
+        says(&about_header(&boards::pi4(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2711)");
+        says(&about_header(&boards::zero2(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2835)");
         for board in [boards::cb1(), boards::rk3566()] {
             assert_eq!(about_header(&board, &["gpio17"]), [], "it has no header of a Raspberry Pi");
         }
@@ -195,7 +193,7 @@ mod tests {
             lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
         };
         let findings = holders(&tree.computer(), std::slice::from_ref(&chip));
-        told(
+        says(
             &findings,
             "gpio_lines",
             Fine,
@@ -206,8 +204,8 @@ mod tests {
         tree.link("proc/77/fd/3", "anon_inode:gpio-line");
         tree.process(78, &["/usr/bin/other"], 1000, &[]);
         tree.link("proc/78/fd/3", "/dev/null");
-        told(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
+        says(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
         let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
-        told(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
+        says(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
     }
 }

@@ -4,8 +4,6 @@
 //! Each check reads files below a root, so that a test can make them. It reports its findings, and calls unknown
 //! whatever it cannot know. Nothing is changed.
 
-#![forbid(unsafe_code)]
-
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -159,7 +157,7 @@ mod tests {
 
     /// Asserts that a check has found something with these words, and returns the remedy.
     #[track_caller]
-    pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
+    pub(super) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
             finding.check == check && finding.status == status && finding.trouble.found().contains(words)
         };

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Outputs after the death of both processes: whether the kernel keeps a level that nobody drives any more.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 
 use crate::cli::computer::Computer;
@@ -47,7 +45,7 @@ fn released_by(computer: &Computer, parameter: &Path) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Ok, Warning};
@@ -63,7 +61,7 @@ mod tests {
         };
         parameter("pinctrl_bcm2835", "Y");
         tree.put("boot/firmware/config.txt", "");
-        let remedy = told(&released(&tree.computer()), CHECK, Warning, "(pinctrl_bcm2835.persist_gpio_outputs)");
+        let remedy = says(&released(&tree.computer()), CHECK, Warning, "(pinctrl_bcm2835.persist_gpio_outputs)");
         assert!(remedy.contains("dtparam=strict_gpiod\\n' | sudo tee -a /boot/firmware/config.txt"), "{remedy}");
         assert!(remedy.contains("gate") && remedy.contains("at each restart"), "{remedy}");
         // A Raspberry Pi 5 has both drivers, and pins of one. strict_gpiod is for that one.
@@ -71,11 +69,11 @@ mod tests {
         tree.put("sys/bus/platform/drivers/pinctrl-rp1/1f000d0000.gpio/uevent", "");
         parameter("pinctrl_rp1", "Y");
         let findings = released(&tree.computer());
-        told(&findings, CHECK, Warning, "pinctrl_rp1.persist_gpio_outputs");
+        says(&findings, CHECK, Warning, "pinctrl_rp1.persist_gpio_outputs");
         assert_eq!(findings.len(), 1);
         parameter("pinctrl_rp1", "N");
         let findings = released(&tree.computer());
-        told(&findings, CHECK, Ok, "makes an output an input");
+        says(&findings, CHECK, Ok, "makes an output an input");
         assert_eq!(findings.len(), 1);
     }
 }

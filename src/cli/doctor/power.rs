@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The firmware's report about a Raspberry Pi's power and temperature.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 use std::process::Command;
 
@@ -51,43 +49,43 @@ fn throttled_bits(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
     if let Some(bits) = files.iter().find_map(|file| computer.text(computer.name(file))) {
         return throttled::bits(&bits);
     }
-    let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
-    throttled::bits(told.trim().strip_prefix("throttled=")?)
+    let bits = output(Command::new(vcgencmd?).arg("get_throttled"))?;
+    throttled::bits(bits.trim().strip_prefix("throttled=")?)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
 
     #[test]
-    fn a_pi_tells_of_its_power() {
+    fn a_pi_reports_its_power() {
         let tree = Tree::new();
-        told(&power(&tree.computer(), None), "power", Fine, "unknown: this is no Raspberry Pi");
+        says(&power(&tree.computer(), None), "power", Fine, "unknown: this is no Raspberry Pi");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
-        told(&power(&tree.computer(), None), "power", Warning, "unknown");
+        says(&power(&tree.computer(), None), "power", Warning, "unknown");
         let file = "sys/devices/platform/soc/soc:firmware/get_throttled";
         tree.put(file, "0\n");
-        told(&power(&tree.computer(), None), "power", Fine, "were good");
+        says(&power(&tree.computer(), None), "power", Fine, "were good");
         tree.put(file, "50001\n");
         let findings = power(&tree.computer(), None);
-        told(&findings, "power", Error, "the voltage is too low");
-        told(&findings, "power", Warning, "at times the processors are throttled");
+        says(&findings, "power", Error, "the voltage is too low");
+        says(&findings, "power", Warning, "at times the processors are throttled");
         assert_eq!(findings.len(), 2);
     }
 
     #[test]
-    fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
+    fn a_pi_s_program_is_asked_where_the_kernel_does_not_say_and_not_waited_for() {
         let tree = Tree::new();
-        let told_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
-        let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
-        told(&good, "power", Warning, "at times the processors are at their temperature limit");
+        let bits_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
+        let good = bits_by("#!/bin/sh\necho throttled=0x80000\n");
+        says(&good, "power", Warning, "at times the processors are at their temperature limit");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
         for script in ["#!/bin/sh\nexec sleep 1000\n", "#!/bin/sh\necho nonsense\n", "not a program"] {
-            told(&told_by(script), "power", Warning, "unknown");
+            says(&bits_by(script), "power", Warning, "unknown");
         }
-        told(&power(&tree.computer(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
+        says(&power(&tree.computer(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
     }
 }

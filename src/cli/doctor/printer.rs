@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Reads klippy's configuration: its pseudo terminals, its LEDs, its drivers on serial ports, and pins by their numbers.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

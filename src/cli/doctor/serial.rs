@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Serial ports for the UARTs of stepper drivers: whether they are there, and who else uses them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 
 use crate::cli::computer::device::Port;
@@ -94,9 +92,9 @@ fn console(computer: &Computer, name: &str, named: &str) -> bool {
     let active = computer.text("/sys/class/tty/console/active").unwrap_or_default();
     // The firmware of a Raspberry Pi replaces serial0 by the port's name.
     let lines = ["/boot/firmware/cmdline.txt", "/boot/cmdline.txt"].iter().filter_map(|file| computer.text(file));
-    let told = lines.flat_map(|line| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>());
-    let mut told = told.filter_map(|word| Some(word.strip_prefix("console=")?.split(',').next()?.to_owned()));
-    active.split_whitespace().any(|console| console == name) || told.any(|port| port == name || port == named)
+    let words = lines.flat_map(|line| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>());
+    let mut named_there = words.filter_map(|word| Some(word.strip_prefix("console=")?.split(',').next()?.to_owned()));
+    active.split_whitespace().any(|console| console == name) || named_there.any(|port| port == name || port == named)
 }
 
 fn missing(computer: &Computer, named: &str) -> String {
@@ -128,7 +126,7 @@ fn no_bluetooth(computer: &Computer) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
@@ -153,13 +151,13 @@ mod tests {
     fn a_free_port_is_fine_and_a_missing_one_is_not() {
         let tree = tree(true);
         for name in ["ttyAMA1", "serial0"] {
-            told(&judged(&tree, name), "serial", Fine, &format!("/dev/{name}"));
+            says(&judged(&tree, name), "serial", Fine, &format!("/dev/{name}"));
         }
-        assert!(told(&judged(&tree, "ttyAMA2"), "serial", Error, "there is no /dev/ttyAMA2").contains("overlay"));
+        assert!(says(&judged(&tree, "ttyAMA2"), "serial", Error, "there is no /dev/ttyAMA2").contains("overlay"));
         // The chip for Bluetooth has it.
         tree.put("sys/bus/serial/devices/serial0-0/uevent", "");
-        assert!(told(&judged(&tree, "serial1"), "serial", Error, "there is no").contains("disable-bt"));
-        assert!(told(&judged(&self::tree(false), "ttyUSB0"), "serial", Error, "there is no").contains("adapter"));
+        assert!(says(&judged(&tree, "serial1"), "serial", Error, "there is no").contains("disable-bt"));
+        assert!(says(&judged(&self::tree(false), "ttyUSB0"), "serial", Error, "there is no").contains("adapter"));
         assert!(ports(&tree.computer(), &BTreeSet::new()).is_empty(), "nothing is said of what is not used");
     }
 
@@ -174,19 +172,19 @@ mod tests {
         {
             tree.put("proc/device-tree/model", model);
             let remedy =
-                told(&judged(&tree, "serial0"), "serial", Warning, "/dev/serial0 is the connector for debugging");
+                says(&judged(&tree, "serial0"), "serial", Warning, "/dev/serial0 is the connector for debugging");
             assert!(remedy.contains("dtoverlay=uart0-pi5") && remedy.ends_with("uart_pin: host:ttyAMA0"), "{remedy}");
-            assert!(told(&judged(&tree, "ttyAMA0"), "serial", Error, "there is no").contains("dtoverlay=uart0-pi5"));
+            assert!(says(&judged(&tree, "ttyAMA0"), "serial", Error, "there is no").contains("dtoverlay=uart0-pi5"));
         }
         tree.put("dev/ttyAMA0", "");
-        told(&judged(&tree, "ttyAMA0"), "serial", Fine, "/dev/ttyAMA0");
+        says(&judged(&tree, "ttyAMA0"), "serial", Fine, "/dev/ttyAMA0");
         let tree = self::tree(true);
         tree.put("dev/ttyS0", "");
-        let remedy = told(&judged(&tree, "ttyS0"), "serial", Warning, "/dev/ttyS0 is the mini-UART");
+        let remedy = says(&judged(&tree, "ttyS0"), "serial", Warning, "/dev/ttyS0 is the mini-UART");
         assert!(remedy.contains("dtoverlay=disable-bt") && remedy.ends_with("uart_pin: host:ttyAMA0"), "{remedy}");
         let pc = self::tree(false);
         pc.put("dev/ttyS0", "");
-        told(&judged(&pc, "ttyS0"), "serial", Fine, "/dev/ttyS0");
+        says(&judged(&pc, "ttyS0"), "serial", Fine, "/dev/ttyS0");
     }
 
     #[test]
@@ -197,14 +195,14 @@ mod tests {
             assert_eq!(judged(&tree, name).len(), 1);
             // The firmware has replaced it for the running kernel.
             tree.put("sys/class/tty/console/active", "tty1 ttyAMA0\n");
-            let remedy = told(&judged(&tree, name), "serial", Error, "the kernel writes its messages to");
+            let remedy = says(&judged(&tree, name), "serial", Error, "the kernel writes its messages to");
             assert!(remedy.contains("do_serial_cons 1"), "{remedy}");
         }
         let tree = tree(false);
         tree.put("sys/class/tty/console/active", "ttyAMA1\n");
-        let remedy = told(&judged(&tree, "ttyAMA1"), "serial", Error, "the kernel writes");
+        let remedy = says(&judged(&tree, "ttyAMA1"), "serial", Error, "the kernel writes");
         assert!(remedy.contains("console=ttyAMA1"), "{remedy}");
-        told(&judged(&tree, "ttyAMA0"), "serial", Fine, "ttyAMA0");
+        says(&judged(&tree, "ttyAMA0"), "serial", Fine, "ttyAMA0");
     }
 
     #[test]
@@ -214,18 +212,18 @@ mod tests {
         tree.put("lib/systemd/system/serial-getty@.service", "");
         let wants = "etc/systemd/system/getty.target.wants/serial-getty@ttyAMA0.service";
         tree.link(wants, "/lib/systemd/system/serial-getty@.service");
-        assert_eq!(told(&judged(&tree, "serial0"), "serial", Error, "serial-getty@ttyAMA0.service"), remedy);
+        assert_eq!(says(&judged(&tree, "serial0"), "serial", Error, "serial-getty@ttyAMA0.service"), remedy);
         std::fs::remove_file(tree.computer().path(format!("/{wants}"))).unwrap();
         tree.process(30, &["/sbin/agetty", "--noreset", "115200", "ttyAMA0", "vt220"], 0, &[]);
-        assert_eq!(told(&judged(&tree, "serial0"), "serial", Error, "agetty (process 30)"), remedy);
-        told(&judged(&tree, "ttyAMA1"), "serial", Fine, "ttyAMA1");
+        assert_eq!(says(&judged(&tree, "serial0"), "serial", Error, "agetty (process 30)"), remedy);
+        says(&judged(&tree, "ttyAMA1"), "serial", Fine, "ttyAMA1");
     }
 
     #[test]
     fn bluetooth_takes_a_port() {
         let tree = tree(true);
         tree.process(31, &["/usr/bin/hciattach", "/dev/ttyAMA0", "bcm43xx", "921600"], 0, &[]);
-        let remedy = told(&judged(&tree, "ttyAMA0"), "serial", Error, "the port of Bluetooth: hciattach");
+        let remedy = says(&judged(&tree, "ttyAMA0"), "serial", Error, "the port of Bluetooth: hciattach");
         assert!(remedy.contains("dtoverlay=disable-bt") && remedy.contains("hciuart"), "{remedy}");
     }
 }

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The service: its configuration, whether it runs and in real time, and the obstacles to it.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::Path;
 
@@ -204,7 +202,7 @@ pub(super) fn watchdog(computer: &Computer, instances: &[Instance], systemctl: O
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
@@ -217,25 +215,25 @@ mod tests {
     #[test]
     fn a_service_that_runs_or_not() {
         let tree = Tree::new();
-        told(&found(&tree), "service", Warning, "not installed");
+        says(&found(&tree), "service", Warning, "not installed");
         tree.put("usr/lib/systemd/system/pinion-mcu.service", "");
-        assert_eq!(told(&found(&tree), "service", Warning, "does not run"), "sudo systemctl enable --now pinion-mcu");
+        assert_eq!(says(&found(&tree), "service", Warning, "does not run"), "sudo systemctl enable --now pinion-mcu");
         tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
         tree.put("proc/10/cgroup", "0::/system.slice/pinion-mcu.service\n");
         assert_eq!(
-            told(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu), and is not started at boot"),
+            says(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu), and is not started at boot"),
             "sudo systemctl enable --now pinion-mcu"
         );
         tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/usr/lib/systemd/system/x");
-        told(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu)");
+        says(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu)");
         // A process that somebody else has started is not the service's.
         tree.put("proc/10/cgroup", "0::/user.slice/user-1000.slice/session-1.scope\n");
-        told(&found(&tree), "service", Ok, "Pinion runs as process 10: no service has started it");
-        told(&found(&tree), "service", Error, "though its service is enabled");
+        says(&found(&tree), "service", Ok, "Pinion runs as process 10: no service has started it");
+        says(&found(&tree), "service", Error, "though its service is enabled");
         fs::remove_dir_all(tree.computer().path("/proc/10")).unwrap();
         tree.process(9, &["pinion", "doctor"], 0, &[]);
         let findings = found(&tree);
-        told(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
+        says(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
         assert_eq!(findings.iter().filter(|finding| finding.check == "service").count(), 1);
     }
 
@@ -253,7 +251,7 @@ mod tests {
         };
         assert!(!is_due("/usr/bin/pinion"));
         assert!(is_due("/usr/bin/pinion (deleted)"));
-        let remedy = told(&found(&tree), "version", Warning, "process 10, which goes on: a restart is due");
+        let remedy = says(&found(&tree), "version", Warning, "process 10, which goes on: a restart is due");
         assert_eq!(remedy, "when no print runs: sudo systemctl restart pinion-mcu");
     }
 
@@ -266,7 +264,7 @@ mod tests {
         let is_told = || found(&tree).iter().any(|finding| finding.check == "board");
         assert!(!is_told());
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=--board sim\n");
-        let remedy = told(&found(&tree), "board", Warning, "pinion-mcu has a simulated printer: no pin");
+        let remedy = says(&found(&tree), "board", Warning, "pinion-mcu has a simulated printer: no pin");
         assert!(
             remedy.contains("board in /etc/pinion/pinion.toml, then sudo systemctl restart pinion-mcu"),
             "{remedy}"
@@ -275,37 +273,37 @@ mod tests {
         assert!(!is_told());
         // People try it by hand in this way.
         tree.process(10, &["pinion", "run", "--board", "sim"], 990, &[]);
-        told(&found(&tree), "board", Ok, "process 10 has a simulated printer");
+        says(&found(&tree), "board", Ok, "process 10 has a simulated printer");
     }
 
     #[test]
     fn real_time_that_was_had_or_not() {
         let tree = Tree::new();
         tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
-        told(&found(&tree), "realtime", Ok, "unknown");
+        says(&found(&tree), "realtime", Ok, "unknown");
         let stat = |policy: &str| format!("11 (co) re) S {} {policy} 0", vec!["0"; 37].join(" "));
         tree.put("proc/10/task/11/stat", stat("0"));
-        told(&found(&tree), "realtime", Warning, "not permitted");
+        says(&found(&tree), "realtime", Warning, "not permitted");
         tree.put("proc/10/task/12/stat", stat("1"));
-        told(&found(&tree), "realtime", Ok, "runs in real time");
+        says(&found(&tree), "realtime", Ok, "runs in real time");
         // Each instance is judged.
         tree.process(12, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 990, &[]);
         let findings = found(&tree);
-        told(&findings, "realtime", Ok, "Pinion (process 10) runs in real time");
-        told(&findings, "realtime", Warning, "Pinion (process 12) was not asked");
+        says(&findings, "realtime", Ok, "Pinion (process 10) runs in real time");
+        says(&findings, "realtime", Warning, "Pinion (process 12) was not asked");
     }
 
     #[test]
     fn the_c_program_is_in_the_way() {
         let tree = Tree::new();
-        told(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
+        says(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "/etc/systemd/system/x");
         assert_eq!(
-            told(&found(&tree), "klipper_mcu", Error, "is enabled"),
+            says(&found(&tree), "klipper_mcu", Error, "is enabled"),
             "sudo systemctl disable --now klipper-mcu.service"
         );
         tree.process(20, &["/usr/local/bin/klipper_mcu", "-r"], 0, &[]);
-        told(&found(&tree), "klipper_mcu", Error, "runs (process 20)");
+        says(&found(&tree), "klipper_mcu", Error, "runs (process 20)");
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
         assert_eq!(
             found(&tree).iter().filter(|finding| finding.check == "klipper_mcu").count(),
@@ -314,7 +312,7 @@ mod tests {
         );
         let tree = Tree::new();
         tree.link("etc/rc2.d/S01klipper_mcu", "../init.d/klipper_mcu");
-        told(&found(&tree), "klipper_mcu", Error, "/etc/init.d/klipper_mcu");
+        says(&found(&tree), "klipper_mcu", Error, "/etc/init.d/klipper_mcu");
     }
 
     #[test]
@@ -322,45 +320,45 @@ mod tests {
         const UNIT: &str = "etc/systemd/system/klipper-mcu.service";
         let tree = Tree::new();
         tree.put(UNIT, "[Service]\nExecStart=/usr/local/bin/klipper_mcu -r\n");
-        told(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
+        says(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
         tree.put("lib/systemd/system/pinion-mcu.service", "");
         tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "x");
         assert_eq!(
-            told(&found(&tree), "klipper_mcu", Warning, &format!("/{UNIT} is still there")),
+            says(&found(&tree), "klipper_mcu", Warning, &format!("/{UNIT} is still there")),
             format!("sudo mv /{UNIT} /{UNIT}.before-pinion && sudo systemctl daemon-reload")
         );
         fs::remove_file(tree.computer().path(UNIT)).unwrap();
         tree.put("lib/systemd/system/klipper-mcu.service", "");
-        let remedy = told(&found(&tree), "klipper_mcu", Warning, "/lib/systemd/system/klipper-mcu.service is still");
+        let remedy = says(&found(&tree), "klipper_mcu", Warning, "/lib/systemd/system/klipper-mcu.service is still");
         assert_eq!(remedy, "sudo systemctl mask klipper-mcu");
         tree.link(UNIT, "/dev/null");
-        told(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
+        says(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
         tree.put("etc/init.d/klipper_mcu", "");
-        told(&found(&tree), "klipper_mcu", Warning, "/etc/init.d/klipper_mcu is still there");
+        says(&found(&tree), "klipper_mcu", Warning, "/etc/init.d/klipper_mcu is still there");
     }
 
     #[test]
     fn a_watchdog_that_is_fed() {
         let tree = Tree::new();
         let look = || watchdog(&tree.computer(), &instances(&tree.computer()).0, None);
-        told(&look(), "watchdog_device", Ok, "there is none");
+        says(&look(), "watchdog_device", Ok, "there is none");
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
-        told(&look(), "watchdog_device", Error, "there is no /dev/watchdog");
+        says(&look(), "watchdog_device", Error, "there is no /dev/watchdog");
         tree.put("dev/watchdog", "");
-        told(&look(), "watchdog_device", Ok, "is there");
+        says(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/pinion/pinion.toml", "watchdog = false\n");
-        assert!(told(&look(), "watchdog_device", Ok, "does not feed").contains("watchdog = true"));
+        assert!(says(&look(), "watchdog_device", Ok, "does not feed").contains("watchdog = true"));
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
         tree.put("etc/systemd/system.conf", "#RuntimeWatchdogSec=20\n");
-        told(&look(), "watchdog_device", Ok, "is there");
+        says(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/systemd/system.conf.d/a.conf", "[Manager]\nRuntimeWatchdogSec=20\n");
-        let remedy = told(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
+        let remedy = says(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
         assert!(remedy.contains("/etc/systemd/system.conf.d/a.pinion.conf"), "{remedy}");
         for unit in ["pinion-mcu", "pinion-mcu@b"] {
             tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}.service"), "x");
         }
         tree.put("etc/default/pinion-mcu-b", "PINION_OPTIONS=-w\n");
-        let remedy = told(&look(), "watchdog_device", Error, "pinion-mcu and pinion-mcu@b are both configured");
+        let remedy = says(&look(), "watchdog_device", Error, "pinion-mcu and pinion-mcu@b are both configured");
         assert!(remedy.contains("/etc/pinion/b.toml"), "{remedy}");
     }
 }

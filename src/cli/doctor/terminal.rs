@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The terminal: whether klippy finds it at the link in its configuration, and whether klippy's user can open it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -95,16 +93,16 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
         let found = format!("{shown} leads to {}, which is no pseudo terminal", device.display());
         return vec![Finding::error(CHECK, found, format!("sudo rm {} && {restart}", word(shown)))];
     }
-    let told = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));
+    let leads = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));
     if opening.is_empty() {
         let unknown = match klippys {
             [] => Finding::ok(CHECK, "who klippy is, is unknown: none runs, and no unit starts one"),
             _ => Finding::ok(CHECK, format!("no klippy's configuration names {shown}"))
                 .or(format!("in printer.cfg: [mcu host] and below it serial: {shown}")),
         };
-        return vec![Finding::ok(CHECK, told), unknown];
+        return vec![Finding::ok(CHECK, leads), unknown];
     }
-    let terminal = Terminal { path, link: &link, way: &way, about: &about, told: &told };
+    let terminal = Terminal { path, link: &link, way: &way, about: &about, leads: &leads };
     let opened = opening.iter().map(|klippy| access(computer, &terminal, instance, klippy));
     opened.chain(wanted_by_several(path, &opening)).collect()
 }
@@ -158,7 +156,7 @@ struct Terminal<'a> {
     way: &'a [PathBuf],
     about: &'a fs::Metadata,
     /// Where the link leads, in words.
-    told: &'a str,
+    leads: &'a str,
 }
 
 /// The remedy for a process that is called like klippy and that no unit started. Any user can have one, and its needs
@@ -176,8 +174,8 @@ fn access(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
 
 fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
     let Klippy { who, found_by, is_running, .. } = klippy;
-    let Terminal { path, link, way, about, told } = *terminal;
-    let (name, told) = (&who.name, format!("{told}, for klippy's user {} ({found_by})", who.name));
+    let Terminal { path, link, way, about, leads } = *terminal;
+    let (name, leads) = (&who.name, format!("{leads}, for klippy's user {} ({found_by})", who.name));
     if let Some(owner) = link_is_refused(computer, path, link, who) {
         let shown = path.display();
         let found = format!("the kernel lets {name} not follow {shown}, a link of {owner}'s (fs.protected_symlinks)");
@@ -193,7 +191,7 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
         return Finding::error(CHECK, found, format!("sudo chmod o+x {}", word(folder.display())));
     }
     if who.may(Access::READ_WRITE, about) {
-        return Finding::ok(CHECK, told);
+        return Finding::ok(CHECK, leads);
     }
     let group = computer.common_group(about);
     let is_member = computer.user(name).is_some_and(|user| user.gids.contains(&about.gid()));
@@ -209,7 +207,7 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
             format!("sudo usermod -aG {} {} && {}", word(group.unwrap_or_default()), word(name), klippy.restart())
         }
     };
-    Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)
+    Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {leads}"), remedy)
 }
 
 /// The owner of a link that the kernel refuses to follow.
@@ -231,7 +229,7 @@ fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> b
 mod tests {
     use super::super::host::klippys;
     use super::super::instance::instances;
-    use super::super::tests::told;
+    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
@@ -262,25 +260,25 @@ mod tests {
     fn a_terminal_that_klippy_s_user_may_open_or_not() {
         let (tree, gid) = with_terminal(0o660);
         let findings = looked(&tree);
-        told(&findings, "terminal", Ok, "leads to /dev/pts/3");
-        told(&findings, "terminal", Ok, "who klippy is, is unknown");
+        says(&findings, "terminal", Ok, "leads to /dev/pts/3");
+        says(&findings, "terminal", Ok, "who klippy is, is unknown");
         tree.process(8, &KLIPPY, PI, &[gid]);
-        told(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
+        says(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
         tree.process(8, &KLIPPY, PI, &[]);
         // Advice about users is only for a service's klippy.
-        let remedy = told(&looked(&tree), "terminal", Warning, "pi, klippy's user (process 8), may not open it");
+        let remedy = says(&looked(&tree), "terminal", Warning, "pi, klippy's user (process 8), may not open it");
         assert!(!remedy.contains("sudo"), "{remedy}");
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
         assert_eq!(
-            told(&looked(&tree), "terminal", Error, "pi, klippy's user (process 8), may not open it"),
+            says(&looked(&tree), "terminal", Error, "pi, klippy's user (process 8), may not open it"),
             "sudo usermod -aG tty pi && sudo systemctl restart klipper"
         );
         tree.put("etc/group", format!("tty:x:{gid}:other,pi\n"));
-        assert!(told(&looked(&tree), "terminal", Error, "may not open").starts_with("sudo systemctl restart klipper"));
+        assert!(says(&looked(&tree), "terminal", Error, "may not open").starts_with("sudo systemctl restart klipper"));
         tree.mode("dev/pts/3", 0o600);
-        assert!(told(&looked(&tree), "terminal", Error, "may not open").starts_with("mode = "));
+        assert!(says(&looked(&tree), "terminal", Error, "may not open").starts_with("mode = "));
         tree.mode("run/pinion", 0o700);
-        told(&looked(&tree), "terminal", Error, "may not enter /run/pinion");
+        says(&looked(&tree), "terminal", Error, "may not enter /run/pinion");
     }
 
     #[test]
@@ -289,7 +287,7 @@ mod tests {
         tree.put("etc/group", format!("root:x:{gid}:\n"));
         tree.process(8, &KLIPPY, PI, &[]);
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
-        let remedy = told(&looked(&tree), "terminal", Error, "may not open it");
+        let remedy = says(&looked(&tree), "terminal", Error, "may not open it");
         assert!(remedy.starts_with("mode = \"0660\" and group = \"tty\" in "), "{remedy}");
     }
 
@@ -300,7 +298,7 @@ mod tests {
         tree.mode("tmp", 0o1777);
         tree.put("proc/sys/fs/protected_symlinks", "1\n");
         // The link's owner is the folder's owner here, as for root's link in root's folder.
-        told(&looked(&tree), "terminal", Ok, "for klippy's user pi");
+        says(&looked(&tree), "terminal", Ok, "for klippy's user pi");
         let tmp = 0o1777;
         assert!(is_protected(tmp, 0, 990, PI), "a link of Pinion's user");
         assert!(is_protected(tmp, 0, 990, 0), "root neither");
@@ -310,21 +308,21 @@ mod tests {
     #[test]
     fn a_link_that_is_none_or_leads_nowhere() {
         let tree = Tree::new();
-        told(&looked(&tree), "terminal", Ok, "as Pinion does not run");
+        says(&looked(&tree), "terminal", Ok, "as Pinion does not run");
         tree.process(10, &["/usr/bin/pinion", "run"], 0, &[]);
-        told(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_mcu");
+        says(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_mcu");
         tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
-        told(&looked(&tree), "terminal", Error, "which is not there");
+        says(&looked(&tree), "terminal", Error, "which is not there");
         let tree = Tree::new();
         tree.link("tmp/klipper_host_mcu", "klipper_host_mcu");
-        told(&looked(&tree), "terminal", Warning, "which is not there");
+        says(&looked(&tree), "terminal", Warning, "which is not there");
         let tree = Tree::new();
         tree.put("tmp/klipper_host_mcu/file", "");
-        let remedy = told(&looked(&tree), "terminal", Error, "/tmp/klipper_host_mcu is a folder");
+        let remedy = says(&looked(&tree), "terminal", Error, "/tmp/klipper_host_mcu is a folder");
         assert!(remedy.starts_with("sudo mv -T /tmp/klipper_host_mcu /tmp/klipper_host_mcu.old && "), "{remedy}");
         let tree = Tree::new();
         tree.put("tmp/klipper_host_mcu", "FORCE_SHUTDOWN\n");
-        let remedy = told(&looked(&tree), "terminal", Error, "exists and is no symbolic link");
+        let remedy = says(&looked(&tree), "terminal", Error, "exists and is no symbolic link");
         assert!(remedy.starts_with("sudo rm /tmp/klipper_host_mcu"), "{remedy}");
     }
 
@@ -358,9 +356,9 @@ mod tests {
         let (tree, gid) = two_printers();
         let findings = looked(&tree);
         assert_eq!(findings.len(), 2, "{findings:#?}");
-        told(&findings, "terminal", Ok, "/tmp/klipper_host_mcu leads to /dev/pts/3");
-        told(&findings, "terminal", Ok, "/dev/pts/4, which is");
-        told(&findings, "terminal", Ok, "for klippy's user other (process 22)");
+        says(&findings, "terminal", Ok, "/tmp/klipper_host_mcu leads to /dev/pts/3");
+        says(&findings, "terminal", Ok, "/dev/pts/4, which is");
+        says(&findings, "terminal", Ok, "for klippy's user other (process 22)");
         // The second user is not in the group.
         tree.process(
             22,
@@ -369,8 +367,8 @@ mod tests {
             &[],
         );
         let findings = looked(&tree);
-        told(&findings, "terminal", Ok, "for klippy's user pi (process 21)");
-        let remedy = told(&findings, "terminal", Error, "other, klippy's user (process 22), may not open it");
+        says(&findings, "terminal", Ok, "for klippy's user pi (process 21)");
+        let remedy = says(&findings, "terminal", Error, "other, klippy's user (process 22), may not open it");
         assert_eq!(remedy, "sudo usermod -aG tty other && sudo systemctl restart klipper-2");
         // The second instance's terminal is closed to its klippy.
         tree.mode("dev/pts/4", 0o600);
@@ -380,7 +378,7 @@ mod tests {
             PI + 1,
             &[gid],
         );
-        let remedy = told(&looked(&tree), "terminal", Error, "other, klippy's user");
+        let remedy = says(&looked(&tree), "terminal", Error, "other, klippy's user");
         assert!(remedy.ends_with("in /etc/pinion/b.toml, then sudo systemctl restart pinion-mcu@b"), "{remedy}");
     }
 
@@ -389,24 +387,24 @@ mod tests {
         let (tree, _) = two_printers();
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
         let findings = looked(&tree);
-        told(&findings, "terminal", Error, "names /tmp/klipper_host_mcu (process 21, process 22), and one can have it");
+        says(&findings, "terminal", Error, "names /tmp/klipper_host_mcu (process 21, process 22), and one can have it");
         assert!(
-            told(&findings, "terminal", Ok, "no klippy's configuration names /tmp/klipper_host_b").contains("serial: ")
+            says(&findings, "terminal", Ok, "no klippy's configuration names /tmp/klipper_host_b").contains("serial: ")
         );
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
-        let remedy = told(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_c, which klippy's");
+        let remedy = says(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_c, which klippy's");
         assert!(remedy.starts_with("sudo systemctl enable --now pinion-mcu@c"), "{remedy}");
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /run/pinion/klipper_host_b\n");
-        let remedy = told(&looked(&tree), "terminal", Error, "names /run/pinion/klipper_host_b, which it takes");
+        let remedy = says(&looked(&tree), "terminal", Error, "names /run/pinion/klipper_host_b, which it takes");
         assert_eq!(remedy, "serial: /tmp/klipper_host_b");
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
         tree.put("proc/22/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
         assert!(!format!("{:?}", looked(&tree)).contains("klipper_host_c"), "a stranger's klippy");
         let script = "/home/other/klipper/klippy/klippy.py";
         tree.process(22, &["/usr/bin/python3", script, "/home/other/printer.cfg"], PI, &[]);
-        let remedy = told(&looked(&tree), "terminal", Warning, "there is no /tmp/klipper_host_c, which klippy's");
+        let remedy = says(&looked(&tree), "terminal", Warning, "there is no /tmp/klipper_host_c, which klippy's");
         assert!(!remedy.contains("sudo"), "{remedy}");
         tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 0, &[]);
-        told(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
+        says(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
     }
 }

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion latency --pin`: the cost of an edge of one line, through the kernel and through registers.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 use std::time::{Duration, Instant};
 

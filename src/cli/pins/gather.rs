@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The wanted part of everything that was found.
 
-#![forbid(unsafe_code)]
-
 use pinion_linux::Inventory;
 use pinion_linux::adc::IioDevice;
 use pinion_linux::gpio::Chip;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The list as tables.
 
-#![forbid(unsafe_code)]
-
 use std::iter;
 
 use crate::cli::page::{Page, aligned};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The status in Prometheus's text exposition format, version 0.0.4.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::page::Page;
 use pinion_runtime::status::form::{BusCounts, McuStatus, Present, State, Status};
 

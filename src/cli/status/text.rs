@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The status as a page for people.
 
-#![forbid(unsafe_code)]
-
 use crate::cli::page::{Page, aligned};
 use pinion_runtime::status::form::{
     BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, RecorderStatus, State, Status,
@@ -141,7 +139,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_tells_all_and_obeys_nothing() {
+    fn a_page_shows_all_and_obeys_nothing() {
         let page = page(&stopped()).to_string();
         for line in [
             "pinion    1, process 5, up for 1 h 1 min",
@@ -161,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_core_does_not_tell_is_left_out() {
+    fn fields_that_the_core_does_not_report_are_left_out() {
         let page = page(&Status { state: State::Unknown, mcu: None, ..stopped() }).to_string();
         assert!(page.contains("the core has not answered") && !page.contains("queues"), "{page}");
     }

@@ -22,7 +22,7 @@ static const struct mock_adc_kind {
 	const char *name;
 	char sign;
 	u8 bits;
-	/* Whether scan_elements tell the resolution; many real ADCs have none. */
+	/* Whether scan_elements has the resolution; many real ADCs have none. */
 	bool has_scan_type;
 } mock_adc_kinds[] = {
 	/* The first one is iio:device0. */

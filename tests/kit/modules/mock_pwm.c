@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-2.0-or-later
 /*
- * A PWM chip of eight channels which holds what it is told.
+ * A PWM chip of eight channels which keeps the settings that it gets.
  *
  * In /sys/devices/platform/mock-pwm:
  *   fail      written: an errno with which each change fails, or 0

@@ -49,7 +49,7 @@ impl Cache {
 
 /// Cargo's target folder. The running harness is in `debug/deps` there.
 fn target() -> Result<PathBuf, String> {
-    let harness = env::current_exe().map_err(|error| format!("cannot tell which program this is: {error}"))?;
+    let harness = env::current_exe().map_err(|error| format!("it is unknown which program this is: {error}"))?;
     let target = harness.ancestors().nth(3).map(Path::to_owned);
     target.ok_or_else(|| format!("{} is not in cargo's target folder: set PINION_VM_CACHE", harness.display()))
 }

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A printer.cfg, and mistakes in it that klippy refuses.
 
-#![forbid(unsafe_code)]
-
 /// A printer of two boards without a mistake.
 pub const PRINTER: &str = include_str!("../two-boards.cfg");
 

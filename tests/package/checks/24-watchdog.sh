@@ -18,9 +18,9 @@ systemctl stop pinion-mcu
 said | grep -- '-w: /dev/watchdog cannot be opened: .* on Raspberry Pi OS systemd: "sudo pinion doctor" has the command'
 not runuser -u pinion -- pinion run --check --config $CONFIG >/run/checked
 grep "error.*RuntimeWatchdogSec=1m in $VENDOR_S" /run/checked
-pinion doctor >/run/told || true
-grep -A 1 "error.*RuntimeWatchdogSec=1m in $VENDOR_S" /run/told
-command=$(sed -n "s/^ *-> \(printf .*daemon-reexec\); or watchdog = false.*/\1/p" /run/told)
+pinion doctor >/run/findings || true
+grep -A 1 "error.*RuntimeWatchdogSec=1m in $VENDOR_S" /run/findings
+command=$(sed -n "s/^ *-> \(printf .*daemon-reexec\); or watchdog = false.*/\1/p" /run/findings)
 [ -n "$command" ]
 bash -ec "$command"
 is "$(systemctl show -P RuntimeWatchdogUSec)" 0 "the timeout of systemd's watchdog"
@@ -29,8 +29,8 @@ mark
 systemctl start pinion-mcu
 identifies
 said | grep '/dev/watchdog resets this computer'
-pinion doctor >/run/told || true
-grep 'ok .*/dev/watchdog is there' /run/told
+pinion doctor >/run/findings || true
+grep 'ok .*/dev/watchdog is there' /run/findings
 systemctl stop pinion-mcu
 cp -p /run/pinion.toml $CONFIG
 rm $VENDOR_S /etc/systemd/system.conf.d/*.conf

@@ -8,7 +8,7 @@ useradd -m -s /bin/bash -G tty far
 UNIT=pinion-link@far@toolhead.local
 SSH=/home/klippy/.ssh
 RUN=/run/user/$(id -u klippy)
-# systemd's PAM module would tell the user's systemd this folder. It is not installed, or each check with sudo took longer.
+# systemd's PAM module would give this folder to the user's systemd. It is not installed, or each check with sudo took longer.
 install -d /run/systemd/system/user@.service.d
 printf '[Service]\nEnvironment=XDG_RUNTIME_DIR=/run/user/%%i\n' >/run/systemd/system/user@.service.d/runtime.conf
 user() { klippy env HOME=/home/klippy XDG_RUNTIME_DIR="$RUN" "$@"; }

@@ -211,7 +211,7 @@ fn bit_banged_buses_and_an_hx711_use_the_registers_by_themselves(way: Way) {
     let mut client = pinion.client();
     CONFIG.iter().for_each(|line| client.send_line(line).expect(line));
     client.query("get_uptime", &[], "uptime", None).expect("a configured micro-controller");
-    let told = |(set, get): (usize, usize), name: &str| {
+    let check = |(set, get): (usize, usize), name: &str| {
         println!("{name}, {way:?}: the kernel wrote {set} times and read {get} times");
         match way {
             Way::Kernel => assert!(set > 30 && get > 15, "{name}"),
@@ -222,7 +222,7 @@ fn bit_banged_buses_and_an_hx711_use_the_registers_by_themselves(way: Way) {
     let calls = Calls::count();
     let sent = [("oid", 0u8.into()), ("data", (&[0x3a_u8, 0xc5][..]).into())];
     client.query("spi_transfer", &sent, "spi_transfer_response", Some(0)).expect("an answer");
-    told(calls.so_far(), "SPI");
+    check(calls.so_far(), "SPI");
 
     let calls = Calls::count();
     let asked = [("oid", 1u8.into()), ("write", (&[0_u8][..]).into()), ("read_len", 1u8.into())];
@@ -238,6 +238,6 @@ fn bit_banged_buses_and_an_hx711_use_the_registers_by_themselves(way: Way) {
     let calls = Calls::count();
     outside.drive(12, false);
     super::gpio::until("two samples are read", || outside.edges(13).len() >= before + 100);
-    told(calls.so_far(), "HX711");
+    check(calls.so_far(), "HX711");
 }
 both_ways!(bit_banged_buses_and_an_hx711_use_the_registers_by_themselves);

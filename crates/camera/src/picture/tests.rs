@@ -263,7 +263,7 @@ fn part(printer: &Printer, layers: u16) -> Vec<Laid> {
     walls.map(piece).collect()
 }
 
-/// How much of the printer's area a color like that of the filament takes.
+/// The share of the printer's area with a color like the filament's.
 fn share_of_filament(picture: &Picture, layout: Layout) -> f64 {
     let [left, top, right, bottom] = layout.area().map(|edge| edge as usize);
     let width = usize::from(layout.size()[0]);
@@ -318,7 +318,7 @@ fn a_shutdown_is_a_red_word_in_each_layout() {
 }
 
 #[test]
-fn the_color_tells_the_speed() {
+fn the_color_shows_the_speed() {
     let [slow, fast] = [20.0, 190.0].map(speed_color);
     assert!(slow[2] > slow[0] && fast[0] > fast[2]);
     assert_eq!(speed_color(f64::INFINITY), speed_color(1e9));

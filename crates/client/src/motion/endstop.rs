@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Endstops, and the trsync that each of them triggers.
 
-#![forbid(unsafe_code)]
-
 use pinion_protocol::clock::Clock;
 
 use crate::config::Config;

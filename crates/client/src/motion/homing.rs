@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Homing against an endstop, with klippy's commands.
 
-#![forbid(unsafe_code)]
-
 use std::time::{Duration, Instant};
 
 use pinion_protocol::clock::Clock;

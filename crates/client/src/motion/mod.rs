@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Moves as step sequences, paced into the MCU's move queue, and homing against an endstop with klippy's commands.
 
-#![forbid(unsafe_code)]
-
 mod endstop;
 mod homing;
 mod profile;

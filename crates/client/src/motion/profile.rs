@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A move of one stepper as runs of steps.
 
-#![forbid(unsafe_code)]
-
 use crate::Error;
 
 /// Highest share by which the interval may shrink within one chord of a ramp. A tenth keeps the chord within half a
@@ -142,7 +140,7 @@ mod tests {
 
     const FREQUENCY_HZ: f64 = 50e6;
 
-    /// The clocks of all steps, calculated with integers only, as in the firmware.
+    /// The clocks of all steps, calculated with integers only, as in an MCU.
     fn step_clocks(profile: &Profile) -> Vec<u64> {
         let (mut clock, mut clocks) = (0u64, Vec::new());
         for run in &profile.runs {

@@ -217,7 +217,7 @@ fn a_fifo_of_31_and_more_counts_as_an_overflow() {
 }
 
 #[test]
-fn rubbish_is_told_as_errors_and_a_status_of_rubbish_is_left_out() {
+fn rubbish_is_reported_as_errors_and_a_status_of_rubbish_is_left_out() {
     for rubbish in [0x00, 0x55, 0xff] {
         let mut rig = Rig::configured(CONFIG);
         plug(&rig, Chip { rubbish: Some(rubbish), ..measuring(1000) });

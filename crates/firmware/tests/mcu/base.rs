@@ -97,7 +97,7 @@ fn pings_are_answered() {
 // ---- configuration
 
 #[test]
-fn the_configuration_is_told() {
+fn the_configuration_is_reported() {
     let mut rig = Rig::new();
     assert_eq!(rig.ask("get_config"), "config is_config=0 crc=0 is_shutdown=0 move_count=0");
     rig.configure(&[STEPPER, "config_trsync oid=3"]);
@@ -345,7 +345,7 @@ fn a_timer_in_the_past_is_too_close_only_if_it_would_be_the_next() {
     rig.send("queue_digital_out oid=1 clock=@10000 on_ticks=0");
     expect_shutdown(&rig, "Timer too close");
 
-    // The MCU is late with a step. As in the firmware, later events wait.
+    // The MCU is late with a step. As in Klipper's C, later events wait.
     let mut rig = Rig::configured(&[STEPPER, OUTPUT]);
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=1000 count=1 add=0"]);
     rig.stall_until(3200);

@@ -51,7 +51,7 @@ fn a_button_that_rests_high_is_not_pressed_from_the_start() {
 }
 
 #[test]
-fn what_is_not_acknowledged_is_told_again() {
+fn presses_that_are_not_acknowledged_are_sent_again() {
     for count in [0_u8, 3] {
         let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
         rig.bench.script_input(A, &[(500, 1)]);
@@ -154,7 +154,7 @@ fn a_line_that_is_gone_stops_the_mcu_and_a_stopped_mcu_samples_no_more() {
     rig.sends_until(103_000, &["buttons_state oid=0 ack_count=0 state=01"]);
 }
 
-/// Button B is on an expander that needs 1500 ticks for a look.
+/// Button B is on an expander that needs 1500 ticks for a read.
 fn with_expander() -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().sleeping.insert(B);
@@ -212,11 +212,11 @@ fn an_expander_that_fails_for_100_ms_stops_the_mcu() {
 fn a_look_that_fails_is_no_sample_and_changes_nothing() {
     let mut rig = with_expander();
     rig.bench.script_input(B, &[(2600, 1), (6000, 0)]);
-    // Samples at 1000, 3000, 5000, 7000. It is high at 3000, but nothing confirms it because the look at 5000 fails.
+    // Samples at 1000, 3000, 5000, 7000. It is high at 3000, but nothing confirms it because the read at 5000 fails.
     rig.run_until(5000);
     rig.bench.state().nacks.insert(B, 3);
     rig.sends_until(100_000, &[]);
-    // It is high from then on. A look with failed tries is reported like one without.
+    // It is high from then on. A read with failed tries is reported like one without.
     rig.bench.script_input(B, &[(100_600, 1)]);
     rig.run_until(102_000);
     rig.bench.state().nacks.insert(B, 2);

@@ -32,7 +32,7 @@ fn only_a_host_on_a_can_bus_has_its_commands() {
 }
 
 #[test]
-fn a_node_tells_its_identity_and_the_health_of_the_bus() {
+fn a_node_reports_its_identity_and_the_health_of_the_bus() {
     let node = Arc::new(CanNode::new([0xa, 0xb, 0xc, 0xd, 0xe, 0xf], None));
     let mut rig = Rig::with_dialect(Arc::new(dialect(Wire::Can(node.clone()))));
     node.assign(4);

@@ -8,7 +8,7 @@ const COUNTER: &str = "config_counter oid=0 pin=30 pull_up=1";
 const QUERY: &str = "query_counter oid=0 clock=@10000 poll_ticks=1000 sample_ticks=20000";
 
 #[test]
-fn edges_are_counted_and_told_in_intervals() {
+fn edges_are_counted_and_reported_in_intervals() {
     let mut rig = Rig::configured(&[COUNTER]);
     // High for 2500 ticks, then low for 2500.
     let edges: Vec<(u64, u8)> = (0..100).map(|n| (12_500 + 2500 * n, (n % 2 == 0).into())).collect();
@@ -18,7 +18,7 @@ fn edges_are_counted_and_told_in_intervals() {
     rig.sends_until(
         60_000,
         &[
-            // The first report comes after the second look, as in the firmware.
+            // The first report comes after the second poll, as in Klipper's C.
             "counter_state oid=0 next_clock=@12000 count=0 count_clock=@10000",
             // Eight edges at 12500, 15000, ..., 30000.
             "counter_state oid=0 next_clock=@33000 count=8 count_clock=@30000",
@@ -66,20 +66,20 @@ fn an_expander_s_pin_is_looked_at_as_often_as_its_worker_can() {
     rig.configure(&[COUNTER]);
     rig.bench.script_input(TACHO, &[(14_000, 1)]);
     rig.send(QUERY);
-    // Looks begin at 10000, 12000, 14000, ...
+    // Polls begin at 10000, 12000, 14000, ...
     rig.sends_until(
         40_000,
         &[
-            // The times are the ends of the looks.
+            // The times are the ends of the polls.
             "counter_state oid=0 next_clock=@12500 count=0 count_clock=@10000",
             "counter_state oid=0 next_clock=@34500 count=1 count_clock=@15500",
         ],
     );
-    // While looks fail, the last level counts for 100 ms.
+    // While polls fail, the last level counts for 100 ms.
     rig.bench.state().broken.insert(TACHO);
     rig.run_until(40_000 + 5_000_000 - 1);
-    let told = told(&rig);
-    assert!(told.len() > 200 && told.iter().all(|state| *state == (1, 15_500)), "{told:?}");
+    let reported = reported(&rig);
+    assert!(reported.len() > 200 && reported.iter().all(|state| *state == (1, 15_500)), "{reported:?}");
     rig.stops_by(50_000 + 5_000_000, "GPIO line read failed");
 }
 
@@ -108,7 +108,7 @@ fn every(ticks: u64, count: u64) -> Vec<(u64, u8)> {
 }
 
 /// The count and time of each `counter_state`.
-fn told(rig: &Rig) -> Vec<(u32, i64)> {
+fn reported(rig: &Rig) -> Vec<(u32, i64)> {
     let number = |text: &str, name: &str| -> i64 {
         let rest = text.split_once(&format!(" {name}=")).unwrap().1;
         rest.trim_start_matches('@').split(' ').next().unwrap().parse().unwrap()
@@ -117,7 +117,7 @@ fn told(rig: &Rig) -> Vec<(u32, i64)> {
 }
 
 #[test]
-fn the_kernel_s_count_is_told_with_the_instant_of_its_last_edge() {
+fn the_kernel_s_count_is_reported_with_the_instant_of_its_last_edge() {
     let mut rig = counted(0);
     rig.bench.script_input(TACHO, &[(20_100, 1), (20_900, 0), (22_500, 1)]);
     rig.send(QUERY);
@@ -139,9 +139,9 @@ fn a_fan_of_20_000_rpm_is_measured_to_a_part_in_a_hundred_thousand() {
     rig.bench.script_input(TACHO, &every(37_500, 20_000));
     rig.send("query_counter oid=0 clock=@1000000 poll_ticks=75000 sample_ticks=50000000");
     rig.run_until(500_000_000);
-    let told = told(&rig);
-    assert_eq!(told.len(), 10);
-    for pair in told.windows(2) {
+    let reported = reported(&rig);
+    assert_eq!(reported.len(), 10);
+    for pair in reported.windows(2) {
         let [(count, at), (next, then)] = pair else { unreachable!() };
         let rpm = f64::from(next - count) / 2.0 / (then - at) as f64 * 50e6 * 60.0 / 2.0;
         assert!((rpm - 20_000.0).abs() < 0.2, "{rpm}");
@@ -164,9 +164,9 @@ fn a_worker_that_is_slower_than_the_interval_misses_turns() {
     let mut rig = counted(30_000);
     rig.bench.script_input(TACHO, &[(12_000, 1), (45_000, 0)]);
     rig.send(QUERY);
-    // The worker looks at 10000 and 50000, but not at 30000.
+    // The worker polls at 10000 and 50000, but not at 30000.
     rig.run_until(85_000);
-    assert_eq!(told(&rig), [(1, 12_000), (2, 45_000)]);
+    assert_eq!(reported(&rig), [(1, 12_000), (2, 45_000)]);
 }
 
 #[test]
@@ -178,7 +178,7 @@ fn a_query_begins_anew_where_the_count_stands() {
     rig.responses();
     rig.send("query_counter oid=0 clock=@20000 poll_ticks=500 sample_ticks=5000");
     rig.run_until(29_999);
-    assert_eq!(told(&rig), [(1, 12_500), (2, 22_000)]);
+    assert_eq!(reported(&rig), [(1, 12_500), (2, 22_000)]);
 }
 
 #[test]
@@ -187,27 +187,27 @@ fn a_pin_that_storms_is_polled_from_then_on() {
     // 25,000 edges a second, for 3 s.
     rig.bench.script_input(TACHO, &every(2000, 75_000));
     rig.send("query_counter oid=0 clock=@1000000 poll_ticks=75000 sample_ticks=50000000");
-    // The time before the first look is too short to judge.
+    // The time before the first poll is too short to judge.
     rig.run_until(5_999_999);
     assert!(rig.bench.state().counted.contains(&TACHO));
     rig.run_until(10_000_000);
     assert!(!rig.bench.state().counted.contains(&TACHO), "the interrupts were not ended");
     rig.run_until(250_000_000);
     // No level lasted long enough to count. After that, polling counts.
-    let told = told(&rig);
-    assert_eq!(told[0], (0, 1_000_000));
-    assert!(told.len() > 2 && told.last().unwrap().0 > 0, "{told:?}");
+    let reported = reported(&rig);
+    assert_eq!(reported[0], (0, 1_000_000));
+    assert!(reported.len() > 2 && reported.last().unwrap().0 > 0, "{reported:?}");
     assert!(rig.shutdown().is_none());
 }
 
-/// The looks between reports send nothing.
+/// The polls between reports send nothing.
 #[test]
-fn it_is_told_once_in_each_sample_ticks() {
+fn it_is_reported_once_in_each_sample_ticks() {
     let mut rig = counted(3000);
     rig.bench.script_input(TACHO, &every(1_000_000, 1000));
     rig.send("query_counter oid=0 clock=@1200000 poll_ticks=75000 sample_ticks=50000000");
     rig.run_until(152_000_000);
-    assert_eq!(told(&rig), [(1, 1_000_000), (51, 51_000_000), (101, 101_000_000), (151, 151_000_000)]);
+    assert_eq!(reported(&rig), [(1, 1_000_000), (51, 51_000_000), (101, 101_000_000), (151, 151_000_000)]);
 }
 
 #[test]
@@ -225,12 +225,12 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
     rig.bench.script_input(TACHO, &edges);
     rig.send("query_counter oid=0 clock=@1040000 poll_ticks=75000 sample_ticks=50000000");
     rig.run_until(300_000_000);
-    let told = told(&rig);
-    assert_eq!(told.len(), 6);
-    for (n, (count, at)) in (0..).zip(&told) {
+    let reported = reported(&rig);
+    assert_eq!(reported.len(), 6);
+    for (n, (count, at)) in (0..).zip(&reported) {
         // A level of 0.375 ms counts, from the end of its edge's ringing.
         let edges = (1_043_000 + n * 50_000_000 - 18_750) / 75_000;
-        assert_eq!((i64::from(*count), *at), (edges, edges * 75_000), "{told:?}");
+        assert_eq!((i64::from(*count), *at), (edges, edges * 75_000), "{reported:?}");
     }
 }
 
@@ -242,7 +242,7 @@ fn bouncing_contacts_are_no_storm() {
     rig.send("query_counter oid=0 clock=@100000 poll_ticks=75000 sample_ticks=250000");
     rig.run_until(50_000_000);
     assert!(rig.bench.state().counted.contains(&TACHO));
-    assert_eq!(told(&rig).pop(), Some((0, 100_000)));
+    assert_eq!(reported(&rig).pop(), Some((0, 100_000)));
 }
 
 #[test]
@@ -255,7 +255,7 @@ fn a_counted_line_that_is_gone_stops_the_mcu() {
 }
 
 #[test]
-fn nothing_is_told_of_a_query_that_a_shutdown_ended() {
+fn no_report_comes_of_a_query_that_a_shutdown_ended() {
     let mut rig = counted(30_000);
     rig.send(QUERY);
     rig.run_until(20_000);
@@ -272,5 +272,5 @@ fn a_pin_with_another_use_is_polled() {
     rig.bench.script_input(TACHO, &[(20_100, 1), (20_900, 0), (22_500, 1)]);
     rig.send(QUERY);
     rig.run_until(40_000);
-    assert_eq!(told(&rig).pop(), Some((1, 23_000)));
+    assert_eq!(reported(&rig).pop(), Some((1, 23_000)));
 }

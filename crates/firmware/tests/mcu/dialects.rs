@@ -9,7 +9,7 @@ use pinion_protocol::vlq::Writer;
 use pinion_testbench::rig::{Rig, hex};
 
 #[test]
-fn an_mcu_speaks_as_it_is_told_at_once_or_after_its_reset() {
+fn an_mcu_changes_its_dialect_at_once_or_after_its_reset() {
     let mut rig = Rig::of(DialectName::Master);
     rig.speak(DialectName::V0_12);
     assert_eq!(rig.dialect().name(), DialectName::V0_12);
@@ -91,7 +91,7 @@ fn a_stopped_mcu_reads_the_other_hosts_blocks_to_their_end() {
 }
 
 #[test]
-fn another_host_is_not_told_what_the_objects_say() {
+fn another_host_does_not_get_what_the_objects_say() {
     let mut rig = Rig::of(DialectName::V0_12);
     rig.configure(&["config_analog_in oid=0 pin=400"]);
     rig.send("query_analog_in oid=0 clock=@20000 sample_ticks=1000 sample_count=2 rest_ticks=100000 min_value=0 max_value=4095 range_check_count=4");

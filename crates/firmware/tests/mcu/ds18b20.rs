@@ -33,7 +33,7 @@ fn reading(next_ms: u64, value: i32, fault: u8) -> String {
 }
 
 #[test]
-fn a_temperature_is_told_when_it_is_there_with_the_time_it_was_asked_for() {
+fn a_temperature_is_reported_when_it_is_there_with_the_time_it_was_asked_for() {
     let mut rig = rig(750, &[Some(85_500), Some(-10_250)]);
     rig.send(&query(-55_000, 125_000));
     rig.sends_until(850 * MS - 1, &[]);
@@ -44,7 +44,7 @@ fn a_temperature_is_told_when_it_is_there_with_the_time_it_was_asked_for() {
 }
 
 #[test]
-fn failures_are_told_with_the_last_temperature_until_there_are_too_many() {
+fn failures_are_reported_with_the_last_temperature_until_there_are_too_many() {
     let values = [Some(20_000), None, None, Some(21_000), None, None, None, None, None];
     let mut rig = rig(750, &values);
     rig.send(&query(0, 100_000));
@@ -61,7 +61,7 @@ fn failures_are_told_with_the_last_temperature_until_there_are_too_many() {
 }
 
 #[test]
-fn a_temperature_out_of_its_range_is_told_and_stops_the_mcu() {
+fn a_temperature_out_of_its_range_is_reported_and_stops_the_mcu() {
     for (value, ends) in [(4999, true), (5000, false), (30_000, false), (30_001, true)] {
         let mut rig = rig(750, &[Some(value)]);
         rig.send(&query(5000, 30_000));
@@ -98,7 +98,7 @@ fn a_slow_reading_leaves_out_a_turn() {
 }
 
 #[test]
-fn a_reading_of_an_earlier_query_is_not_told_and_steps_are_in_time() {
+fn a_reading_of_an_earlier_query_is_not_reported_and_steps_are_in_time() {
     let mut rig = Rig::new();
     rig.bench.script_ds18b20(SERIAL, &[Some(20_000)]);
     rig.bench.state().answer_ticks = 750 * MS as u32;

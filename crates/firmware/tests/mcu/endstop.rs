@@ -168,12 +168,12 @@ fn a_timeout_that_is_set_anew_in_time_does_not_expire() {
 }
 
 #[test]
-fn the_host_pulls_the_trigger_and_is_not_told_when() {
+fn the_host_pulls_the_trigger_and_gets_no_report_of_it() {
     let mut rig = homing();
     rig.run_until(4500);
     rig.responses();
     let answer = rig.ask("trsync_trigger oid=3 reason=2");
-    // Clock 0, as in the firmware.
+    // Clock 0, as in Klipper's C.
     assert_eq!(answer, "trsync_state oid=3 can_trigger=0 trigger_reason=2 clock=@-10000000");
     rig.run_until(100_000);
     assert_eq!(steps(&mut rig), ("stepper_position oid=0 pos=-4".into(), "stepper_position oid=1 pos=-4".into()));

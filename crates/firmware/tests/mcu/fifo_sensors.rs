@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The accelerometers with a FIFO that is read in blocks (LIS2DW, LIS3DH, MPU9250, ICM20948, BMI160), on SPI and on
-//! I2C. These tests cover what ADXL345's tests do not.
+//! I2C. The ADXL345's tests cover the rest.
 
 use std::sync::{Arc, Mutex};
 
@@ -227,7 +227,7 @@ fn at_full_rate_no_sample_is_lost_and_a_status_counts_those_of_its_instant() {
 }
 
 #[test]
-fn samples_that_the_chip_drops_are_told() {
+fn samples_that_the_chip_drops_are_reported() {
     for setup in SETUPS {
         // The BMI160's count just stays at its maximum.
         if setup.model == Bmi160 {
@@ -365,7 +365,7 @@ fn rubbish_keeps_the_mcu_from_nothing() {
     }
 }
 
-/// 63 samples. The firmware counts their bytes in a `u8`.
+/// 63 samples. Klipper's C counts their bytes in a `u8`.
 #[test]
 fn a_lis2dw_that_does_not_answer_takes_the_bus_for_two_blocks() {
     for setup in SETUPS.iter().filter(|setup| setup.model == Lis2dw) {

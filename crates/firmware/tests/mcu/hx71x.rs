@@ -210,7 +210,7 @@ fn a_chip_that_cannot_be_switched_stops_the_mcu() {
 fn a_status_counts_what_was_read_what_is_being_read_and_what_is_in_the_chip() {
     let (mut rig, _chip) = rig(0, 1, 1000);
     rig.send(QUERY);
-    // The chip wakes at 1000 and has its first sample four periods later. The timer looks every 62500 ticks.
+    // The chip wakes at 1000 and has its first sample four periods later. The timer polls every 62500 ticks.
     let first = 1000 + 4 * PERIOD;
     let look = 41 * 62_500;
     let status = |at: u64, buffered: u32| {
@@ -255,7 +255,7 @@ fn a_chip_that_does_not_answer_as_it_should_sends_errors_until_it_is_asked_anew(
 
 #[test]
 fn a_reading_that_is_not_back_in_time_is_an_error_and_counted() {
-    // It is back after 10 looks instead of 8.
+    // It is back after 10 polls instead of 8.
     let (mut rig, _chip) = rig(7, 1, 600_000);
     rig.send(QUERY);
     rig.run_until(40 * PERIOD);
@@ -309,7 +309,7 @@ fn a_probe_triggers_at_its_sample_and_not_at_errors() {
 fn measurements_that_begin_anew_amid_a_reading_have_none_of_it() {
     let (mut rig, chip) = rig(7, 1, 30_000);
     rig.send(QUERY);
-    // The clock falls at 30000. The first look that finds a sample is at 2562500.
+    // The clock falls at 30000. The first poll that finds a sample is at 2562500.
     rig.run_until(2_580_000);
     assert_eq!(chip.lock().unwrap().pulses, 0, "the reading is on its way");
     rig.send(QUERY);
@@ -383,7 +383,7 @@ fn samples_arrive_over_spi_with_pulses_of_one_bit() {
         assert!(counts.iter().all(|count| *count == 24 + u32::from(gain_channel)), "{counts:?}");
         let transfers = rig.bench.transfers();
         assert!(transfers.iter().all(|transfer| (transfer.mode, transfer.rate_hz) == (0, 500_000)));
-        // The first one starts the chip. All others are looks and waves, and each byte ends low.
+        // The first one starts the chip. All others are polls and readings, and each byte ends low.
         assert_eq!(transfers[0].data, [&[0xff; 8][..], &[0]].concat());
         for transfer in &transfers[1..] {
             assert!(
@@ -444,7 +444,7 @@ fn a_disturbed_bit_on_spi_is_an_error_until_it_is_asked_anew() {
     assert_eq!(self::samples(&rig, 0)[..12], [-1; 12]);
 }
 
-/// The output stays high at the end. What the controller makes of it, the next start restarts the chip.
+/// The output stays high at the end. Even if the controller lowers it, the next start restarts the chip.
 #[test]
 fn the_chip_on_spi_is_switched_off_and_started_again() {
     let (mut rig, chip) = spi_rig(7, 3, 0);
@@ -475,7 +475,7 @@ fn a_shutdown_or_a_failure_of_the_bus_ends_the_samples() {
 
 #[test]
 fn the_two_pins_on_spi_belong_together() {
-    for (pins, told) in [
+    for (pins, words) in [
         (format!("dout_pin={MISO} sclk_pin={}", MOSI + 1), "write sclk_pin: spidev0"),
         (format!("dout_pin={MISO} sclk_pin=11"), "miso0 has another clock than gpio11"),
         (format!("dout_pin=10 sclk_pin={MOSI}"), "no pin 700"),
@@ -483,6 +483,6 @@ fn the_two_pins_on_spi_belong_together() {
         let mut rig = Rig::new();
         rig.refuses(&[&format!("config_hx71x oid=0 gain_channel=1 {pins}")], "Not an output pin");
         let notes = rig.notes();
-        assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
+        assert!(notes.iter().any(|note| note.contains(words)), "{notes:?}");
     }
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! I2C devices: transfers to a chip, the report of a missing answer, and what waits for the answer.
+//! I2C devices: transfers to a chip, the report of a missing answer, and the commands that wait for the answer.
 
 use std::sync::{Arc, Mutex};
 
@@ -109,7 +109,7 @@ fn a_read_that_took_its_time_to_fail_is_not_tried_again() {
 }
 
 #[test]
-fn a_chip_that_is_unplugged_is_told_once_and_is_there_when_it_is_back() {
+fn a_chip_that_is_unplugged_is_reported_once_and_is_there_when_it_is_back() {
     let mut rig = Rig::configured(DEVICE);
     rig.notes();
     for _ in 0..5 {

@@ -86,13 +86,13 @@ fn crc(words: &[u8]) -> u16 {
 /// byte of an ADS131M04's frame.
 fn plug(rig: &Rig, is_ads131: bool, values: Values) -> Arc<Mutex<u8>> {
     let status = Arc::new(Mutex::new(0));
-    let (read, told) = (Arc::new(Mutex::new(0)), status.clone());
+    let (read, shown_status) = (Arc::new(Mutex::new(0)), status.clone());
     let on_spi = read.clone();
     rig.bench.plug_spi(0, move |at, bytes| {
         *on_spi.lock().unwrap() = at / PERIOD;
         let words = values(at / PERIOD).into_iter().flat_map(|value| value.to_be_bytes()[1..].to_vec());
         let frame: Vec<u8> = if is_ads131 {
-            let mut frame: Vec<u8> = [*told.lock().unwrap(), 0, 0].into_iter().chain(words).collect();
+            let mut frame: Vec<u8> = [*shown_status.lock().unwrap(), 0, 0].into_iter().chain(words).collect();
             let crc = crc(&frame).to_be_bytes();
             frame.extend([crc[0], crc[1], 0]);
             frame
@@ -357,8 +357,8 @@ proptest! {
     }
 }
 
-/// The times are those of the firmware's own code (src/stepper.c of bleeding-edge-v2), compiled for this computer. The
-/// intervals overflow 32 bits, and what is left over overflows 16 bits.
+/// The times are those of Kalico's own code (src/stepper.c of bleeding-edge-v2), compiled for this computer. The
+/// intervals overflow 32 bits, and the rest overflows 16 bits.
 #[test]
 fn numbers_that_overflow_do_so_as_in_the_firmware() {
     let moves = [(3_510_139_707, 5, 26_700, -7539, 24), (13_043, 7, 22_714, -8570, -9)];

@@ -22,13 +22,13 @@ struct Ldc {
     words: fn(u64) -> u32,
     /// The last sample that was read, and the last sample that STATUS reported.
     read: u64,
-    told: u64,
+    reported: u64,
     /// Registers that fail, with the number of failures left.
     nacks: Vec<(u8, u32)>,
 }
 
 fn plug(bench: &Bench, words: fn(u64) -> u32) -> Arc<Mutex<Ldc>> {
-    let ldc = Arc::new(Mutex::new(Ldc { words, read: 0, told: 0, nacks: Vec::new() }));
+    let ldc = Arc::new(Mutex::new(Ldc { words, read: 0, reported: 0, nacks: Vec::new() }));
     let (on_i2c, on_line) = (ldc.clone(), ldc.clone());
     bench.plug_i2c(0, ADDRESS, move |at, write, read| {
         let mut ldc = on_i2c.lock().unwrap();
@@ -46,7 +46,7 @@ fn plug(bench: &Bench, words: fn(u64) -> u32) -> Arc<Mutex<Ldc>> {
                 words & 0xffff
             }
             0x18 => {
-                ldc.told = now;
+                ldc.reported = now;
                 if ldc.read < now { 1 << 3 | 1 << 6 } else { 0 }
             }
             _ => panic!("register 0x{register:02x} is klippy's"),
@@ -54,7 +54,7 @@ fn plug(bench: &Bench, words: fn(u64) -> u32) -> Arc<Mutex<Ldc>> {
         read.copy_from_slice(&(word as u16).to_be_bytes());
         Ok(())
     });
-    bench.plug_line(INTB, move |at, _| on_line.lock().unwrap().told == at / PERIOD);
+    bench.plug_line(INTB, move |at, _| on_line.lock().unwrap().reported == at / PERIOD);
     ldc
 }
 
@@ -110,7 +110,7 @@ fn every_sample_arrives_once() {
 }
 
 #[test]
-fn a_status_tells_the_instants_and_counts_every_sample_once() {
+fn a_status_reports_the_instants_and_counts_every_sample_once() {
     for (sensor, takes) in [(WITHOUT, 2000), (WITH_INTB, 0)] {
         let (mut rig, _ldc) = rig(sensor, good, 2000);
         rig.send(QUERY);
@@ -242,7 +242,7 @@ fn a_register_that_is_not_acknowledged_twice_is_no_error() {
 }
 
 #[test]
-fn a_chip_that_is_unplugged_is_told_of_once_and_goes_on_when_it_is_back() {
+fn a_chip_that_is_unplugged_is_reported_once_and_goes_on_when_it_is_back() {
     let (mut rig, _ldc) = rig(WITHOUT, good, 0);
     rig.send(QUERY);
     rig.run_until(2 * PERIOD + 1);

@@ -58,7 +58,7 @@ fn a_send_is_over_before_the_next_command() {
 }
 
 #[test]
-fn a_bus_that_fails_is_told_once_and_stops_nothing() {
+fn a_bus_that_fails_is_reported_once_and_stops_nothing() {
     let mut rig = Rig::configured(&[CHAIN]);
     rig.notes();
     let warnings = |rig: &Rig| rig.notes().iter().filter(|note| note.starts_with("warning: ")).count();

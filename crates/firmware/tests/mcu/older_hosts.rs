@@ -239,7 +239,7 @@ fn adxl345_data(sequence: u16, numbers: std::ops::Range<u8>) -> String {
 }
 
 #[test]
-fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
+fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_sent() {
     for dialect in [V0_11, V0_12] {
         let (mut rig, chip) = adxl345(dialect, 0);
         rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
@@ -247,7 +247,7 @@ fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
         assert_eq!(chip.lock().unwrap().written, []);
         rig.run_until(17_500);
         assert_eq!(chip.lock().unwrap().written, [(5000, [0x2d, 0x08])]);
-        // Ten samples of five bytes. Two more were there at the last look, at 17000.
+        // Ten samples of five bytes. Two more were there at the last read, at 17000.
         assert_eq!(rig.responses(), [adxl345_data(0, 0..10)], "{dialect}");
         let status = "adxl345_status oid=1 clock=@17500 query_ticks=0 next_sequence=1 buffered=10 fifo=0 limit_count=0";
         assert_eq!(rig.ask("query_adxl345_status oid=1"), status);
@@ -281,7 +281,7 @@ fn an_adxl345_that_is_read_as_it_is_to_end_loses_no_sample() {
 }
 
 #[test]
-fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
+fn an_adxl345_that_makes_no_sense_is_reported_so_and_ends() {
     let (mut rig, chip) = adxl345(V0_12, 0);
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
     rig.run_until(6000);
@@ -295,7 +295,7 @@ fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
 }
 
 #[test]
-fn an_adxl345_that_makes_no_sense_for_once_at_its_end_tells_all_its_samples() {
+fn an_adxl345_that_makes_no_sense_once_at_its_end_sends_all_its_samples() {
     for samples in [3, 0] {
         let (mut rig, chip) = adxl345(V0_12, 0);
         rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=40000");
@@ -346,7 +346,7 @@ fn mpu9250(dialect: DialectName) -> Vec<&'static str> {
 }
 
 #[test]
-fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
+fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_reports_overflows() {
     for dialect in [V0_11, V0_12] {
         let mut rig = Rig::of(dialect);
         let written: Heard = Arc::default();
@@ -373,7 +373,7 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
     }
 }
 
-/// The firmware asks the chip how much its FIFO has, but reports the value from the last reading. klippy dates samples
+/// Klipper's C asks the chip how much its FIFO has, but reports the value from the last reading. klippy dates samples
 /// by this count. So here the status has the current count.
 #[test]
 fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
@@ -407,9 +407,9 @@ fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
             rig.run_until(at);
             let status = rig.ask("query_mpu9250_status oid=1");
             assert_eq!(number(&status, "buffered"), 0);
-            let told = 8 * number(&status, "next_sequence") + number(&status, "fifo");
+            let reported = 8 * number(&status, "next_sequence") + number(&status, "fifo");
             let made = number(&status, "clock") / PERIOD - *began.lock().unwrap() / PERIOD;
-            assert_eq!(told, made, "{status}");
+            assert_eq!(reported, made, "{status}");
         }
         assert!(*taken.lock().unwrap() > 100);
     }
@@ -575,7 +575,7 @@ fn an_eddy_current_probe_triggers_above_its_threshold() {
 }
 
 #[test]
-fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_silent_the_mcu() {
+fn an_eddy_current_probe_that_reports_an_error_ends_the_homing_and_one_that_is_silent_the_mcu() {
     for dialect in [V0_13, Kalico] {
         let (mut rig, value) = ldc1612(dialect);
         // An error counts even before homing begins.

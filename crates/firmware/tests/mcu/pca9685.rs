@@ -97,8 +97,8 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
         rig.send_all(commands);
         rig.stops_by(200_000, text);
         // Both outputs have their shutdown values: off, and on.
-        let told = bytes(&chip);
-        let last = |register: u8| told.iter().rfind(|bytes| bytes[0] == register);
+        let sent = bytes(&chip);
+        let last = |register: u8| sent.iter().rfind(|bytes| bytes[0] == register);
         assert_eq!(last(14), Some(&vec![14, 0, 0, 0, 0x10]));
         assert_eq!(last(66), Some(&vec![66, 0, 0x10, 0, 0]));
         assert!(!rig.mcu.has_pending_values());

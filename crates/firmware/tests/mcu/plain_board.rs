@@ -3,15 +3,10 @@
 
 use std::sync::Arc;
 
-use pinion_firmware::board::{
-    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig,
-    Range, SpiConfig,
-};
+use pinion_firmware::board::{Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, Line};
 use pinion_firmware::shutdown::Shutdown;
-use pinion_testbench::board::{FakeBoard, MISO, MOSI, SERIAL};
+use pinion_testbench::board::{Bench, FakeBoard, MISO, MOSI, PlainBoard, SERIAL};
 use pinion_testbench::rig::{Rig, hex};
-
-struct PlainBoard(FakeBoard);
 
 struct PlainLine(Arc<dyn Line>);
 
@@ -49,51 +44,15 @@ impl BusDevice for I2cChip {
     }
 }
 
-impl Board for PlainBoard {
-    fn describe(&self) -> String {
-        self.0.describe()
-    }
-
-    fn pins(&self) -> Vec<Range> {
-        self.0.pins()
-    }
-
-    fn spi_buses(&self) -> Vec<Range> {
-        self.0.spi_buses()
-    }
-
-    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
-        let ClaimedLine { line, sleeps_on } = self.0.line(pin, direction)?;
+fn board(bench: Bench) -> impl Board {
+    PlainBoard(FakeBoard(bench), |board: &mut FakeBoard, pin, direction| {
+        let ClaimedLine { line, sleeps_on } = board.line(pin, direction)?;
         Ok(ClaimedLine { line: Arc::new(PlainLine(line)), sleeps_on })
-    }
-
-    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
-        self.0.adc(pin)
-    }
-
-    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.0.spi(config)
-    }
-
-    fn i2c_buses(&self) -> Vec<Range> {
-        self.0.i2c_buses()
-    }
-
-    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        self.0.i2c(config)
-    }
-
-    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
-        self.0.pwm(config)
-    }
-
-    fn reset(&mut self) {
-        self.0.reset();
-    }
+    })
 }
 
 fn rig() -> Rig {
-    Rig::on_board(0, |bench| PlainBoard(FakeBoard(bench)))
+    Rig::on_board(0, board)
 }
 
 /// Configures an object. Returns the text for the host, and the log's lines.
@@ -161,7 +120,7 @@ fn a_plain_line_turns_round_in_a_message() {
 
 #[test]
 fn a_board_where_nothing_comes_or_goes_has_no_view() {
-    let mut board = PlainBoard(FakeBoard(rig().bench));
+    let mut board = board(rig().bench);
     assert!(board.view().is_none() && !board.look_again());
 }
 

@@ -56,14 +56,14 @@ fn a_channel_that_fails_stops_the_mcu() {
     rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
     rig.stops_by(2_000, "PWM write failed");
     let notes = rig.notes();
-    let told = notes.iter().any(|note| note.starts_with("trouble: PWM write failed: PWM output oid 0 (pwm0)"));
-    assert!(told, "it is still on: {notes:?}");
+    let logged = notes.iter().any(|note| note.starts_with("trouble: PWM write failed: PWM output oid 0 (pwm0)"));
+    assert!(logged, "it is still on: {notes:?}");
 }
 
 const SECOND: &str = "config_pwm_out oid=1 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0";
 const SET: &str = "set_pwm_out pin=500 cycle_ticks=50000 value=100";
 
-/// Klipper allows this with `[duplicate_pin_override]`. Its firmware then opens the channel again.
+/// Klipper allows this with `[duplicate_pin_override]`. Klipper's C then opens the channel again.
 #[test]
 fn two_objects_may_have_one_channel() {
     let mut rig = Rig::configured(&[HEATER, SECOND]);

@@ -96,7 +96,7 @@ fn rig(sensor: &str, frame: fn(u64) -> Vec<u8>, answer_ticks: u32) -> (Rig, Arc<
     (rig, adc)
 }
 
-/// The query of a sensor, with a look every tenth of [`PERIOD`].
+/// The query of a sensor, which is read every tenth of [`PERIOD`].
 fn query(sensor: &str) -> String {
     format!("query_{} oid=1 rest_ticks=10000", name(sensor))
 }

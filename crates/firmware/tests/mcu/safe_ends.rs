@@ -37,7 +37,7 @@ fn what_can_not_be_written_is_tried_again_until_it_is() {
         let troubles: Vec<_> = notes.iter().filter(|note| note.starts_with("trouble: ")).collect();
         assert!(troubles.len() == 1 && troubles[0].contains(name), "{notes:?}");
         assert_eq!(*notes.last().unwrap(), format!("safe: {name}"));
-        assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=Command request"], "the host is told once");
+        assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=Command request"], "the host gets it once");
     }
 }
 
@@ -81,7 +81,7 @@ fn a_reset_waits_for_no_more_than_the_last_writes() {
     rig.configure(&[HEATER]);
 }
 
-/// After 20 timers in a row, then after every 100, the firmware checks if the next one is over 100 ms late.
+/// After 20 timers in a row, then after every 100, Klipper's C checks if the next one is over 100 ms late.
 #[test]
 fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
     let pulses = |late_ticks: u64| {

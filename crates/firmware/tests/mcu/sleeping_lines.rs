@@ -94,25 +94,25 @@ fn an_endstop_is_sampled_by_the_worker() {
     rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
     home(&mut rig, 10_000);
     rig.run_until(1_000_000);
-    // Looks begin at 10000, 60000 and 110000. The last one ends at 130000, after the change. The look that confirms it
+    // Reads begin at 10000, 60000 and 110000. The last one ends at 130000, after the change. The read that confirms it
     // ends at 150000.
     assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
 }
 
 #[test]
-fn a_look_that_began_before_a_sample_is_due_is_not_taken_for_it() {
+fn a_read_that_began_before_a_sample_is_due_is_not_taken_for_it() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(0, 1), (25_000, 0)]);
     home(&mut rig, 1000);
     rig.run_until(5000);
-    // Homing begins again during the look.
+    // Homing begins again during the read.
     home(&mut rig, 10_000);
     rig.run_until(1_000_000);
-    assert_eq!(rig.responses(), [""; 0], "the switch was open at 41000, when the second look ended");
+    assert_eq!(rig.responses(), [""; 0], "the switch was open at 41000, when the second read ended");
 }
 
 #[test]
-fn a_query_is_answered_with_a_fresh_look_before_the_next_command() {
+fn a_query_is_answered_with_a_fresh_read_before_the_next_command() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(10_000, 1)]);
     assert_eq!(rig.ask("endstop_query_state oid=2"), "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");
@@ -175,18 +175,18 @@ fn trigger(rig: &mut Rig) -> i64 {
 }
 
 #[test]
-fn an_endstop_is_dated_by_the_end_of_the_look_that_saw_it() {
+fn an_endstop_is_dated_by_the_end_of_the_read_that_saw_it() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
     home(&mut rig, 10_000);
     rig.run_until(1_000_000);
-    // The look that saw it began at 110000.
+    // The read that saw it began at 110000.
     assert_eq!(trigger(&mut rig), 130_000);
 }
 
 #[test]
-fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
-    // The core stands still for 15 ms before the look is requested.
+fn an_endstop_is_dated_by_its_read_after_a_stall_too() {
+    // The core stands still for 15 ms before the read is requested.
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(800_000, 1)]);
     home(&mut rig, 10_000);
@@ -194,7 +194,7 @@ fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
     rig.stall_until(850_000);
     rig.run_until(2_000_000);
     assert_eq!(trigger(&mut rig), 870_000);
-    // The core stands still while the worker looks. The level that the look saw counts from the look's end.
+    // The core stands still while the worker reads. The level that the read saw counts from the read's end.
     let mut rig = self::rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(75_000, 1)]);
     home(&mut rig, 10_000);
@@ -205,7 +205,7 @@ fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
 }
 
 #[test]
-fn one_failed_look_ends_no_homing_and_three_do_at_once() {
+fn one_failed_read_ends_no_homing_and_three_do_at_once() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
     home(&mut rig, 10_000);
@@ -236,10 +236,10 @@ fn a_homing_whose_chip_hangs_stops_the_mcu_after_100_ms() {
 }
 
 #[test]
-fn a_query_looks_again_for_100_ms() {
+fn a_query_reads_again_for_100_ms() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(0, 1)]);
-    // 20 looks with three tries each.
+    // 20 reads with three tries each.
     rig.bench.state().nacks.insert(PIN + 1, 60);
     let state = rig.ask("endstop_query_state oid=2");
     assert_eq!(state, "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");

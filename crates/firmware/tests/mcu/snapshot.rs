@@ -133,14 +133,14 @@ fn calls_to_lines_of_expanders_to_adcs_and_to_pwm_channels_are_counted() {
     let counts = |transfers, errors, retries| Some(BusCounts { transfers, errors, retries });
     let line = |pin| filled.lines.iter().find(|line| line.pin == Pin(pin)).unwrap().bus;
     assert_eq!(line(200), counts(2, 1, 1));
-    // There are two looks. Three tries fail in the first, and one in the second.
+    // There are two reads. Three tries fail in the first, and one in the second.
     assert_eq!(line(201), counts(5, 4, 3));
     assert_eq!(line(6), None, "the core reads it");
     assert_eq!((filled.objects[3].bus, filled.objects[4].bus), (counts(3, 2, 2), counts(2, 1, 1)));
 }
 
 #[test]
-fn values_and_queues_are_told() {
+fn values_and_queues_are_reported() {
     let mut rig = Rig::configured(&[
         "config_pwm_out oid=0 pin=500 cycle_ticks=50000 value=100 default_value=0 max_duration=0",
         "config_stepper oid=1 step_pin=0 dir_pin=1 invert_step=-1 step_pulse_ticks=0",

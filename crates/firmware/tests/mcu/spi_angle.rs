@@ -56,7 +56,7 @@ fn entries(rig: &Rig) -> Vec<String> {
 }
 
 #[test]
-fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
+fn each_sensor_is_asked_in_its_way_and_its_angle_reported_with_its_time() {
     // Half a turn is 0x8000, low byte first. A byte takes 10 ticks, and the shift is 2. A sensor that latches at the
     // beginning is 0 late. The others are late by their bytes.
     for (chip, words, entry) in [
@@ -82,7 +82,7 @@ fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
     }
 }
 
-/// The TLE5012B latches at the end of a pulse of 1 us on its select line, without a clock meanwhile.
+/// The TLE5012B latches at the end of a pulse of 1 us on its select line, without a clock during the pulse.
 #[test]
 fn a_tle5012b_is_selected_for_a_microsecond_before_it_is_read() {
     let mut rig = rig(TLE5012B, 0, 1);
@@ -128,7 +128,7 @@ fn what_there_was_no_time_for_is_an_entry_too() {
 }
 
 #[test]
-fn a_transfer_above_50_us_tells_no_time_and_no_angle() {
+fn a_transfer_above_50_us_gives_no_time_and_no_angle() {
     for chip in [A1333, AS5047D, MT6816, MT6826S] {
         for (answer_ticks, fits) in [(2500, true), (2501, false)] {
             let mut rig = rig(chip, 0, answer_ticks);

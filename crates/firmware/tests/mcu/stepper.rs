@@ -426,7 +426,7 @@ fn a_move_after_a_long_pause_starts_on_its_tick() {
     }
 }
 
-/// The firmware compares 32-bit clocks. A step that seems to lie in the past comes as soon as the pulse before it
+/// Klipper's C compares 32-bit clocks. A step that seems to lie in the past comes as soon as the pulse before it
 /// allows. The step after it is counted from the time when it should have come.
 #[test]
 fn an_interval_that_grows_past_half_the_clocks_range_looks_past() {

@@ -42,7 +42,7 @@ fn the_types_have_the_firmware_s_numbers() {
 }
 
 #[test]
-fn what_is_sent_to_a_chip_and_what_is_told() {
+fn queries_to_a_chip_and_reports_to_the_host() {
     let cases: [(u8, &[&[u8]], u32, u8); 4] = [
         (MAX31855, &[&[0, 0, 0, 0]], 0x1122_3344, 4),
         (MAX31856, &[&[0x0c, 0, 0, 0], &[0x0f, 0]], 0x22_3344, 0x22),
@@ -131,7 +131,7 @@ fn a_bus_slower_than_the_interval_loses_turns() {
 }
 
 #[test]
-fn an_answer_to_an_earlier_query_is_not_told() {
+fn an_answer_to_an_earlier_query_is_not_reported() {
     let (mut rig, _) = with_word(3000, 400);
     rig.send(QUERY);
     rig.run_until(2000);

@@ -97,7 +97,7 @@ proptest! {
     ) {
         let (config, rx) = if one_wire { (ONE_WIRE, TX) } else { (TWO_WIRES, RX) };
         let mut rig = Rig::configured(&[config]);
-        // Four bits of silence: the firmware does not listen then.
+        // Four bits of silence: Klipper's C does not listen then.
         let from = QUIET + 44 * BIT + wait + 200;
         rig.bench.script_input(rx, &speak(&message, from, BIT as f64 * off));
         rig.send(&send(READ_IFCNT, 10));
@@ -292,7 +292,7 @@ fn a_line_of_an_expander_is_refused() {
 /// How long a port waits for a byte: 79 bits and 50 ms.
 const PORT_LIMIT: u64 = 79 * BIT + 2_500_000;
 
-/// An MCU with a serial port, the messages that it sent, and what it receives after each of them.
+/// An MCU with a serial port, the messages that it sent, and the bytes that it receives after each of them.
 fn port(mut answer: impl FnMut(&[u8]) -> Vec<u8> + Send + 'static) -> (Rig, Arc<Mutex<Vec<Vec<u8>>>>) {
     let mut rig = Rig::new();
     let sent: Arc<Mutex<Vec<Vec<u8>>>> = Arc::default();
@@ -408,7 +408,7 @@ fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
 
 #[test]
 fn a_port_that_cannot_be_used_is_refused() {
-    for (config, broken, reason, told) in [
+    for (config, broken, reason, words) in [
         ("rx_pin=800 pull_up=1 tx_pin=800", true, "Unable to open serial port", "pin 800 is gone"),
         (
             "rx_pin=800 pull_up=1 tx_pin=10",
@@ -424,6 +424,6 @@ fn a_port_that_cannot_be_used_is_refused() {
         }
         rig.refuses(&[&format!("config_tmcuart oid=0 {config} bit_time=1250")], reason);
         let notes = rig.notes();
-        assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
+        assert!(notes.iter().any(|note| note.contains(words)), "{notes:?}");
     }
 }

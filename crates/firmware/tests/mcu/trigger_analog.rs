@@ -159,7 +159,7 @@ fn a_sensor_that_falls_silent_ends_homing_with_its_error() {
     let mut rig = homing(0, GT, 4000, &[1000]);
     rig.run_until(151_000);
     rig.send("query_analog_in oid=2 clock=@0 sample_ticks=0 sample_count=0 rest_ticks=0 bytes_per_report=0 min_value=0 max_value=0 range_check_count=0");
-    // The last sample was at 150000. The monitor looks at 155000. Its fourth look after that is one too many.
+    // The last sample was at 150000. The monitor checks at 155000. Its fourth check after that is one too many.
     assert_eq!(triggered(&mut rig), Some((42, 195_000)));
 }
 

@@ -223,7 +223,7 @@ mod tests {
         assert!(has("analog0", 4096, 8));
     }
 
-    /// In the C program a number of gpiochip14 is also that of an ADC channel.
+    /// In Klipper's C a number of gpiochip14 also means an ADC channel.
     #[test]
     fn no_line_has_the_number_of_a_channel() {
         let published = Names::default().ranges();
@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn two_adcs_of_one_name_are_told_apart_by_number() {
+    fn two_adcs_of_one_name_are_distinguished_by_number() {
         let adcs = vec![adc(0, "ads1115", &["voltage0"]), adc(1, "ads1115", &["voltage0"])];
         let found: Vec<String> = names(vec![], adcs).into_iter().map(|n| n.0).collect();
         assert_eq!(found, ["iio0/voltage0", "iio1/voltage0"]);

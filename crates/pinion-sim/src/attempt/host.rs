@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A klippy that this program starts, and its API server.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::fs::File;
 use std::io::{Read, Write};

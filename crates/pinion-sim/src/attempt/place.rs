@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The line of the configuration that klippy's words are about.
 
-#![forbid(unsafe_code)]
-
 use pinion_printer_config::pins::Aliases;
 use pinion_printer_config::{Config, Place, Section};
 

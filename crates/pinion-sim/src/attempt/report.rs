@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The report of `--try`: one line for each step, then a verdict.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::path::Path;

@@ -3,8 +3,6 @@
 //!
 //! klippy stops if it or an MCU is late. A busy computer is a reason that says nothing about a printer.cfg.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};

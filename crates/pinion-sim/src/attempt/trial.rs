@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A klippy on the user's configuration: its commands, its restarts, and what a step asks it and the printer.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io;
 use std::path::PathBuf;

@@ -2,8 +2,6 @@
 //! One heater. A sensor's readings become temperatures, an output is pulsed in software, and a proportional-integral
 //! loop connects them.
 
-#![forbid(unsafe_code)]
-
 use std::time::{Duration, Instant};
 
 use pinion_client::config::Config;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The options for a printer.cfg of one's own.
 
-#![forbid(unsafe_code)]
-
 use std::path::PathBuf;
 
 use clap::Args;

@@ -2,8 +2,6 @@
 //! The pins that sections claim, by klippy's rules (`lookup_pin` of klippy/pins.py): one owner each, unless both share it
 //! in the same way.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{HashMap, HashSet};
 
 use pinion_printer_config::pins::{Aliases, Pin};

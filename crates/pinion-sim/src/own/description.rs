@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A description while it is made.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, HashSet};
 
 use toml::{Table, Value};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Probes, lights, sensors, displays and other things.
 
-#![forbid(unsafe_code)]
-
 use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;

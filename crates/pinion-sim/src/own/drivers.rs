@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Stepper drivers with a bus.
 
-#![forbid(unsafe_code)]
-
 use pinion_printer_config::{Section, Trouble};
 use pinion_sim::{Tmc2209Config, Tmc5160Config};
 

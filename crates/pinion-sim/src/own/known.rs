@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The sections of Klipper and Kalico: the names of their modules in `klippy/extras` and `klippy/kinematics`.
 
-#![forbid(unsafe_code)]
-
 use std::path::Path;
 
 use pinion_printer_config::{Config, Section};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Motors, their kinematics, and endstops at the positions that the configuration has.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 
 use pinion_printer_config::{Limit, Section, Trouble};

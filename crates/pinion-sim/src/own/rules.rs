@@ -2,8 +2,6 @@
 //! klippy's rules for the options of sections that stand for things: what must be there, and its range. A rule is here if
 //! Klipper and Kalico share it. klippy itself knows all others.
 
-#![forbid(unsafe_code)]
-
 use pinion_printer_config::pins::{MAIN, Pin};
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim PRINTER.CFG`: its printer, its folder, and what the user does next.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};

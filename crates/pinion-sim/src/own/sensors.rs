@@ -4,8 +4,6 @@
 //! The numbers are those of Klipper's `klippy/extras/temperature_sensors.cfg` and `adc_temperature.py` (GPL-3.0). Each has
 //! its origin there: the makers' data sheets.
 
-#![forbid(unsafe_code)]
-
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
 use super::description::Entry;

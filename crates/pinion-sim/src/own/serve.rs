@@ -3,8 +3,6 @@
 //!
 //! The user's files are never changed. The copy differs in the way to each MCU and in the places where klippy writes.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::{Path, PathBuf};
 

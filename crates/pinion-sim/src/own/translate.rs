@@ -4,8 +4,6 @@
 //! A section that stands for a thing becomes that thing. All other pins of the configuration exist, too, with nothing at
 //! them: so klippy finds each pin that it asks for.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use pinion_printer_config::pins::{Aliases, MAIN, Pin};

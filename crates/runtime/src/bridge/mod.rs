@@ -9,8 +9,6 @@
 //! then. Klipper's protocol skips sync bytes between blocks, so they need no protocol of their own. The first one says
 //! that the far end has the terminal open.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod attach;
 pub(crate) mod near;
 mod round_trip;

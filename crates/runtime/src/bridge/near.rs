@@ -4,8 +4,6 @@
 //! There is always a connection, or an attempt, also without a host. So the log reports an error early, and a host
 //! does not wait for ssh. The host's first bytes stay in the pty until the far end has its terminal open.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};

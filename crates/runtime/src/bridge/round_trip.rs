@@ -2,8 +2,6 @@
 //! How long a block of the host takes to its acknowledgement: the round trip of the connection, and the MCU's time for
 //! the block.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::fmt;
 use std::time::Duration;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! ssh as a child: keys, encryption and accounts are its own.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::PathBuf;
@@ -259,7 +257,7 @@ mod tests {
 
     #[test]
     fn a_failure_is_one_line_with_its_remedy() {
-        let told = |messages: &str, code: i32| {
+        let explained = |messages: &str, code: i32| {
             judge(messages, Some(ExitStatus::from_raw(code << 8)), &target("ssh")).to_string()
         };
         for (messages, code, line) in [
@@ -281,29 +279,32 @@ mod tests {
             ("[    12.3] ERROR /tmp/x: it is gone: start it\n", 1, "pi@toolhead: /tmp/x: it is gone: start it"),
             ("", 255, "pi@toolhead: ssh ended (exit status: 255): try ssh pi@toolhead by hand, as this user"),
         ] {
-            assert_eq!(told(messages, code), line);
+            assert_eq!(explained(messages, code), line);
         }
     }
 
     #[test]
     fn a_remedy_has_the_options_of_ssh() {
-        let told = |ssh: &str, messages: &str| {
+        let explained = |ssh: &str, messages: &str| {
             let trouble = judge(messages, Some(ExitStatus::from_raw(SSH_FAILED << 8)), &target(ssh));
             trouble.remedy.unwrap().into_string()
         };
         let unknown_key = "Host key verification failed.";
         let denied = "pi@toolhead: Permission denied (publickey).";
-        assert_eq!(told("ssh -p 2222", ""), "try ssh -p 2222 pi@toolhead by hand, as this user");
+        assert_eq!(explained("ssh -p 2222", ""), "try ssh -p 2222 pi@toolhead by hand, as this user");
         assert_eq!(
-            told("/opt/ssh -p2222", unknown_key),
+            explained("/opt/ssh -p2222", unknown_key),
             "/opt/ssh -p2222 pi@toolhead once by hand, as this user, and compare its key"
         );
         let options = "-p 2222 -i /home/pi/key -oProxyJump=gate";
-        assert_eq!(told(&format!("ssh {options}"), denied), format!("ssh-copy-id {options} pi@toolhead, as this user"));
+        assert_eq!(
+            explained(&format!("ssh {options}"), denied),
+            format!("ssh-copy-id {options} pi@toolhead, as this user")
+        );
         // ssh-copy-id does not have these.
         for options in ["-J gate", "-4", "-v -p 2222"] {
             assert_eq!(
-                told(&format!("ssh {options}"), denied),
+                explained(&format!("ssh {options}"), denied),
                 format!(
                     "add this user's key (~/.ssh/*.pub) to ~/.ssh/authorized_keys there, by ssh {options} pi@toolhead"
                 )

@@ -4,8 +4,6 @@
 //! The first byte of a message is the kind of [`Message`]. A message about a line or a file comes with its
 //! descriptor. The guardian answers each with [`TAKEN`] or [`REFUSED`], except for [`Message::Goodbye`].
 
-#![forbid(unsafe_code)]
-
 /// Longest message.
 pub(super) const MESSAGE_BYTES: usize = 256;
 

@@ -25,8 +25,6 @@
 //!
 //! For tests: with `PINION_TEST_HANG` in the environment SIGUSR2 makes the core hang.
 
-#![forbid(unsafe_code)]
-
 mod message;
 mod outputs;
 mod program;
@@ -126,7 +124,7 @@ impl Guardian {
 
     /// Ends the guardian. The outputs must be at their shutdown values.
     pub fn goodbye(self) {
-        if self.tell_goodbye().is_err() {
+        if self.report_goodbye().is_err() {
             return;
         }
         let has_ended = || !matches!(waitpid(self.pid, Some(WaitPidFlag::WNOHANG)), Ok(WaitStatus::StillAlive));
@@ -138,7 +136,7 @@ impl Guardian {
         }
     }
 
-    fn tell_goodbye(&self) -> io::Result<()> {
+    fn report_goodbye(&self) -> io::Result<()> {
         let message = Message::Goodbye.encode().ok_or(io::ErrorKind::InvalidInput)?;
         send(self.socket.as_raw_fd(), &message, MsgFlags::MSG_NOSIGNAL)?;
         Ok(())
@@ -461,7 +459,7 @@ mod tests {
 
     #[test]
     fn a_program_with_threads_can_not_be_guarded() {
-        // libtest runs tests in threads, unless told otherwise.
+        // libtest runs tests in threads by default.
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let other = thread::spawn(move || stopped.recv());
         let error = Guardian::start(&Recording::of_a_test()).err().unwrap();

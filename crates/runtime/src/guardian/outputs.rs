@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The outputs that the guardian holds, and how it drives them.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::iter;
 use std::os::fd::OwnedFd;

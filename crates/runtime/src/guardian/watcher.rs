@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The guardian process. It watches the program, and drives the outputs when the program cannot.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::CStr;
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};

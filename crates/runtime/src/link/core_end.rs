@@ -2,8 +2,6 @@
 //! The link's end of the core. Blocks and requests go in. Responses and log lines come out. It keeps an account of the
 //! blocks.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host's end of the link thread: whether a host is there, the blocks of its input, and the output for it.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::Path;
@@ -100,7 +98,7 @@ impl HostEnd {
     }
 
     /// Whether the link's descriptor would report room for bytes.
-    pub(crate) fn tells_of_room(&self) -> bool {
+    pub(crate) fn reports_room(&self) -> bool {
         self.link.due().is_none()
     }
 

@@ -4,8 +4,6 @@
 //! A number acknowledges all blocks before it. So a block counts only when all blocks before it are done too. This
 //! matters for blocks that the link answers at once, while the core is still busy with earlier blocks.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 
 /// Highest number of blocks that the link has answered and that do not count yet. klippy sends at most 12 blocks before
@@ -144,7 +142,7 @@ mod tests {
         Respond,
         /// The core is done with its block.
         Finish,
-        /// The link looks how far the core is.
+        /// The link reads how far the core is.
         Look,
         /// The link frames the core's responses, and acknowledges the finished blocks that it saw.
         GiveOut,

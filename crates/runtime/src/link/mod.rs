@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The link's thread: it takes blocks from the host to the core, and responses back.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod core_end;
 pub(crate) mod handshake;
 pub(crate) mod host_end;

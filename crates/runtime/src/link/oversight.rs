@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Everything that may end the program or watches over it: signals, the guardian, the watchdogs.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;

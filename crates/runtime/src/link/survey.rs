@@ -2,8 +2,6 @@
 //! Searches the board and the wire again when a host comes. A chip may have appeared since the program started: its
 //! driver was loaded late at boot, or somebody has plugged it in. So the host reads the present names.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};

@@ -5,8 +5,6 @@
 //! So the host's clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
 //! It also answers `get_config` from the core's last word about it, if the core has nothing to do before it.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -163,7 +161,7 @@ impl LinkThread {
     /// Serves the host until the program has to end.
     pub(crate) fn run(&mut self) -> io::Result<End> {
         self.oversight.ready();
-        self.tell_status();
+        self.report_status();
         loop {
             let now = monotonic();
             if let Some(why) = self.oversight.tick(now) {
@@ -237,7 +235,7 @@ impl LinkThread {
         self.core.request(request);
     }
 
-    fn tell_status(&self) {
+    fn report_status(&self) {
         self.oversight.status(&self.host.summary());
     }
 
@@ -252,7 +250,7 @@ impl LinkThread {
         if !stalled {
             events |= PollFlags::POLLIN;
         }
-        if !self.host.is_out() && self.host.tells_of_room() {
+        if !self.host.is_out() && self.host.reports_room() {
             events |= PollFlags::POLLOUT;
         }
         // The terminal is the first. poll(2) waits for the kernel's thread that moves its bytes. An event of the core that
@@ -306,7 +304,7 @@ impl LinkThread {
             self.request(Request::Shutdown(stop));
         }
         if read.is_gone || read.is_new_host || self.host.is_open() != was_open {
-            self.tell_status();
+            self.report_status();
         }
         if read.is_new_host {
             self.handshake.begin(self.host.terminal());

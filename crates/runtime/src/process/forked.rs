@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The common start of the program's forked processes.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::CStr;
 use std::os::fd::RawFd;
 

@@ -2,8 +2,6 @@
 //! The program's other processes: the guardian, and the search for the host. Both are forked before the program has
 //! threads, because a process with threads cannot be forked.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::CStr;
 
 use log::warn;

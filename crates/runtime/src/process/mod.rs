@@ -2,8 +2,6 @@
 //! Pinion as a process of the kernel and of the service manager: real time, signals, the processes that it forks,
 //! watchdogs.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod forked;
 pub mod helpers;
 pub(crate) mod notify;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Informs the service manager about the program's state: sd_notify(3).
 
-#![forbid(unsafe_code)]
-
 use std::env;
 use std::ffi::OsStr;
 use std::io;

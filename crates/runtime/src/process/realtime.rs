@@ -2,8 +2,6 @@
 //! Real time: scheduling class, locked memory, timer slack, processor. Steps that the kernel does not permit are left
 //! out. The log then names the limit and the remedy.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::hint;
 use std::io;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Signals to the program. The link waits for them beside the host's bytes.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};

@@ -5,8 +5,6 @@
 //! The link feeds them, so a link that hangs does not feed them. The core hangs if its heartbeat is missing for as long
 //! as the guardian allows. A worker hangs if one job takes longer than [`JOB_LIMIT`].
 
-#![forbid(unsafe_code)]
-
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::AsFd;

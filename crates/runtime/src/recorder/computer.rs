@@ -2,8 +2,6 @@
 //! The kernel's accounts of this computer: how long threads waited for a processor, and what else slows the
 //! computer down. Not every computer has all of them.
 
-#![forbid(unsafe_code)]
-
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
@@ -295,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn this_computer_tells_how_long_a_thread_ran() {
+    fn this_computer_reports_how_long_a_thread_ran() {
         let ring = ring_of(256);
         let mut computer = Computer::new("/".into(), Writer::new(ring, "sampler").unwrap());
         computer.watch(Watched::Core, nix::unistd::gettid(), ring_of(8));

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Records the edges of outputs, if somebody asks for it.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::Pin;

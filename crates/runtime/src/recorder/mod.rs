@@ -3,8 +3,6 @@
 //! thread of low priority reads the kernel's accounts some times a second (`computer.rs`). At each stop of the MCU it
 //! keeps the rings in a file, and logs who was late. If the program dies or hangs, the guardian does that.
 
-#![forbid(unsafe_code)]
-
 mod computer;
 mod edges;
 mod memory;

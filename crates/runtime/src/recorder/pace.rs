@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How often something may be done.
 
-#![forbid(unsafe_code)]
-
 use std::time::Duration;
 
 /// A number of times at once, and then one more after each span of time.

@@ -2,8 +2,6 @@
 //! The core's trace writer. It costs a few stores for each turn of the core. It neither allocates nor calls the kernel,
 //! except when the MCU is configured or stops.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use nix::sys::eventfd::EventFd;

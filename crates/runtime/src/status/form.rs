@@ -6,8 +6,6 @@
 //! field is renamed, moved or removed. Add a field with `#[serde(default)]`: a running Pinion may be older
 //! than the command that asks it.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 

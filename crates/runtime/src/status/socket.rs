@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The socket of the status: its path, and the thread that serves it.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};

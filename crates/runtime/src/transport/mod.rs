@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The ways between a host and the MCU, in a file each. Each implements [`Transport`].
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::io;
 use std::os::fd::BorrowedFd;

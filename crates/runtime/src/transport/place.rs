@@ -2,8 +2,6 @@
 //! The file at a link's place: one judgment for the program that puts the link there, for `pinion run --check` and
 //! for `pinion doctor`.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::Path;
 

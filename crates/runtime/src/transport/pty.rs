@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The pseudo terminal that the host opens, and the symbolic link that leads to it.
 
-#![forbid(unsafe_code)]
-
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -30,22 +28,22 @@ use crate::transport::terminal_group::{CLOSED, TerminalGroup};
 use crate::trouble::refused;
 use pinion_linux::own_folder::OwnFolder;
 
-/// The folder where others leave files in the link's place.
+/// Folder in which a service's stop command may leave a file in place of the link.
 const TMP: &str = "/tmp";
 /// The stop command of Klipper's own service writes this to the link's path, even if no program serves there.
 const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
 /// How often the terminal is restored while no host is there. There is no event when a client has changed it.
 const RESTORE_EVERY: Duration = Duration::from_secs(1);
-/// How long to wait for another program that serves a link in the same folder. Everybody may lock that folder.
+/// How long to wait for another program that makes its link in the same folder. Any user may lock that folder.
 const TURN_MAX: Duration = Duration::from_secs(3);
-/// How often to check if that program's turn has ended.
+/// How often to check if that program has unlocked the folder.
 const TURN_LOOK: Duration = Duration::from_millis(10);
 
 /// A terminal that a host finds by a symbolic link.
 ///
-/// The kernel reports that the host has gone: the master hangs up when the last process has closed the slave end. So
-/// our own slave end must be closed while a host is there. It is open while no host is there, or the master would be
-/// hung up all that time.
+/// The kernel reports that the host is gone: the master hangs up when the last process has closed the slave end. So our
+/// own slave end is closed while a host is there. It is open while no host is there: otherwise the master would report a
+/// hang-up all that time.
 pub(crate) struct Pty {
     master: OwnedFd,
     /// Our own slave end, open while no host is there.
@@ -122,7 +120,7 @@ impl Pty {
     }
 
     /// Restores the terminal, if that is due. A client may leave it closed to others (TIOCEXCL), stopped (tcflow(3)) or
-    /// with other settings. Then the next host could not open or use it.
+    /// with other settings. The next host could then not open or use it.
     pub(crate) fn restore(&mut self) {
         if self.restore_at.is_none_or(|at| monotonic() < at) {
             return;
@@ -173,8 +171,8 @@ fn folder_of(link: &Path) -> &Path {
     link.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Waits until no other program is about to serve a link in this folder. It gives up when that takes too long, because
-/// another user may hold the lock.
+/// Waits until no other program makes a link in this folder. Gives up after [`TURN_MAX`], because another user may hold
+/// the lock.
 fn turn(symlink: &Path) -> Option<Flock<File>> {
     let mut folder = File::open(folder_of(symlink)).ok()?;
     let until = monotonic() + TURN_MAX;
@@ -202,7 +200,7 @@ impl Transport for Pty {
     }
 
     fn event(&self) -> Option<BorrowedFd<'_>> {
-        // Without a host and without our own slave end it hangs up all the time.
+        // With neither a host nor our own slave end, the master reports a hang-up all the time.
         (self.restore_at.is_none() || self.slave.is_some()).then(|| self.master.as_fd())
     }
 
@@ -215,9 +213,9 @@ impl Transport for Pty {
             self.restore();
         }
         match read(&self.master, buffer) {
-            // A host that stops the MCU and closes the terminal has been heard, even if this thread comes late.
+            // The last bytes of a host count, for example a stop of the MCU, even if this thread reads them late.
             Ok(len) if len > 0 || !hung_up => Ok(Input::Bytes(len)),
-            // The kernel answers EIO when the host has gone and all its bytes have been read.
+            // The kernel answers EIO when the host is gone and all its bytes are read.
             Ok(_) | Err(Errno::EIO) if hung_up => Ok(Input::Gone),
             Ok(_) | Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Input::Bytes(0)),
             Err(error) => Err(error.into()),
@@ -232,8 +230,8 @@ impl Transport for Pty {
         }
     }
 
-    /// It closes our slave end, so that the master hangs up when the host goes. It returns false if the host has gone
-    /// already, as `echo` in a shell does.
+    /// Closes our slave end, so that the master hangs up when the host closes the terminal. Returns false if the host is
+    /// gone already, for example an `echo` in a shell.
     fn meet_host(&mut self) -> bool {
         self.slave = None;
         self.restore_at = None;
@@ -249,7 +247,7 @@ impl Transport for Pty {
         None
     }
 
-    /// It opens our slave end again, so that the master no longer hangs up.
+    /// Opens our slave end again, so that the master no longer reports a hang-up.
     fn part_from_host(&mut self) {
         self.restore_at = Some(Duration::ZERO);
         self.restore();
@@ -274,7 +272,7 @@ fn grant(device: &Path, access: &Access) -> Result<(), Trouble> {
     give(device, access.group.as_deref()).or_else(|trouble| match access.group {
         Some(_) => Err(trouble),
         // The user has not asked for the usual group, so the program runs without it. Only root or a member may give a
-        // file to it. (The C program leaves the group as it is.)
+        // file to a group. (Klipper's C leaves the group as it is.)
         None => {
             warn!("{}", trouble.of(CLOSED));
             Ok(())
@@ -306,11 +304,11 @@ fn place_symlink(device: &Path, link: &Path) -> Result<(), Trouble> {
     } else if let Some(obstacle) = place.obstacle(link) {
         return Err(obstacle);
     }
-    // A rename replaces a stale link in one step. So a host finds a link at any time.
+    // A rename replaces a stale link in one step, so that a host finds a link at any time.
     let mut fresh = link.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
-    // A process with our number may have left it there, in a power cut.
+    // An earlier process with our number may have left it there in a power cut.
     let _ = fs::remove_file(&fresh);
     let renamed = || fs::rename(&fresh, link).inspect_err(|_| drop(fs::remove_file(&fresh)));
     match symlink(device, &fresh).and_then(|()| renamed()) {
@@ -326,11 +324,11 @@ fn is_full(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
-/// Whether a service's stop command left this file in /tmp because there was no link. The file is root's or our own,
-/// with nothing else in it. (The C program removes any file.)
+/// Whether a service's stop command left this file in /tmp because there was no link. The file belongs to root or to us,
+/// and has nothing else in it. (Klipper's C removes any file.)
 fn is_left_over(path: &Path) -> bool {
     let read = || -> io::Result<(fs::Metadata, String)> {
-        // Another file may take its place now. Do not follow another user's link, and do not wait for a pipe's writer.
+        // Another file may take its place now. So do not follow another user's link, and do not wait for a pipe's writer.
         let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK;
         let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
         let mut content = String::new();
@@ -368,7 +366,7 @@ mod tests {
     fn a_host_is_there_until_the_last_process_has_closed_the_terminal() {
         let (_folder, mut pty, open) = terminal();
         assert!(!hangs_up(&pty));
-        // Hosts that opened and closed the terminal without writing must make no difference.
+        // Hosts that open and close the terminal without writing make no difference.
         for _ in 0..100 {
             drop(open());
         }
@@ -384,17 +382,17 @@ mod tests {
 
     /// klippy's FIRMWARE_RESTART: it stops the MCU, and closes the terminal 30 ms later.
     #[test]
-    fn what_a_host_has_written_before_it_went_is_read() {
+    fn bytes_that_a_host_wrote_before_it_closed_the_terminal_are_read() {
         let (_folder, mut pty, open) = terminal();
         let mut host = open();
         assert!(pty.meet_host());
         host.write_all(b"stop").unwrap();
         drop(host);
         let mut bytes = [0; 3];
-        // The kernel moves the bytes after the hang-up, too.
+        // The kernel may deliver bytes after the hang-up.
         while !hangs_up(&pty) {}
-        for (heard, text) in [(Input::Bytes(3), "sto"), (Input::Bytes(1), "p")] {
-            assert_eq!(pty.read(&mut bytes, true).unwrap(), heard);
+        for (input, text) in [(Input::Bytes(3), "sto"), (Input::Bytes(1), "p")] {
+            assert_eq!(pty.read(&mut bytes, true).unwrap(), input);
             assert!(bytes.starts_with(text.as_bytes()));
         }
         assert_eq!(pty.read(&mut bytes, true).unwrap(), Input::Gone);
@@ -403,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_a_stop_command_left_gives_way_to_the_link_and_no_other_does() {
+    fn only_a_file_of_a_stop_command_gives_way_to_the_link() {
         let access = Access { mode: 0o600, group: None };
         let file = |folder: &Path, content: &str| {
             let mut file = tempfile::Builder::new().prefix("klipper_host_").tempfile_in(folder).unwrap();
@@ -433,18 +431,18 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_was_half_made_when_the_power_went_does_not_prevent_the_next_one() {
+    fn a_link_that_a_power_cut_left_half_made_does_not_prevent_the_next_one() {
         let folder = tempfile::tempdir().unwrap();
         let link = folder.path().join("tty");
         let half_made = folder.path().join(format!("tty.{}", std::process::id()));
         symlink("/dev/pts/no-longer-there", &half_made).unwrap();
         let pty = Pty::open(&link, &Access { mode: 0o600, group: None }).unwrap();
         assert_eq!(fs::read_link(&link).unwrap(), pty.device);
-        assert!(fs::symlink_metadata(&half_made).is_err(), "it is left");
+        assert!(fs::symlink_metadata(&half_made).is_err(), "the half-made link is still there");
     }
 
     #[test]
-    fn who_wrote_and_left_is_heard_and_is_not_there() {
+    fn a_host_that_wrote_and_left_is_read_and_is_gone() {
         let (_folder, mut pty, open) = terminal();
         open().write_all(b"FORCE_SHUTDOWN\n").unwrap();
         assert!(!pty.meet_host());
@@ -455,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn the_next_host_does_not_read_what_was_for_the_last_one() {
+    fn the_next_host_does_not_read_the_bytes_for_the_last_one() {
         let (_folder, mut pty, open) = terminal();
         let mut host = open();
         host.write_all(b"?").unwrap();

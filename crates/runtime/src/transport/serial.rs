@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A serial port: a UART, or the port of a USB gadget (`ttyGS0`). It is unknown whether a host is at the other end, so
-//! it is there as long as it sends.
-
-#![forbid(unsafe_code)]
+//! A serial port: a UART, or the port of a USB gadget (`ttyGS0`). The port does not say whether a host is at its other
+//! end. So a host counts as there while it sends.
 
 use std::fs::File;
 use std::io;
@@ -36,12 +34,12 @@ pub(crate) struct SerialLine {
 enum State {
     /// No other program may open it while it is in use.
     Open(Flock<File>),
-    /// It is gone. The time of the next try.
+    /// The port is gone. The time of the next try to open it.
     Gone(Duration),
 }
 
 impl SerialLine {
-    /// Opens a port. One that is not there is opened later.
+    /// Opens a port. A missing port is opened later.
     pub(crate) fn open(path: &Path, baud: Option<u32>) -> Result<SerialLine, Trouble> {
         let state = if path.exists() {
             State::Open(uart::open_line(path, baud)?)

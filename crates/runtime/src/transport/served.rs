@@ -2,8 +2,6 @@
 //! Whether a running program serves the terminal that a link leads to. A second program at the same link would take
 //! the host from the first one.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::fs::{self, Metadata};
 use std::os::unix::fs::MetadataExt;
@@ -20,8 +18,8 @@ use pinion_linux::uart::is_pseudo_terminal;
 const LINKS_MAX: usize = 40;
 /// Longest part of /proc/PID/cgroup that is read.
 const GROUPS_BYTES_MAX: u64 = 4096;
-/// How much younger than its link a served terminal may be. Klipper's own program changes the mode after it makes the
-/// link.
+/// How much younger than its link a served terminal may be. klipper_mcu changes the terminal's mode after it has made
+/// the link.
 const YOUNGER_MAX_S: i64 = 1;
 /// The programs that serve hosts, each with its name for people.
 const PROGRAMS: [(&str, &str); 3] =
@@ -42,8 +40,8 @@ pub struct Served {
 
 /// The terminal behind a link, if a running program serves it.
 ///
-/// The kernel removes a terminal when its program ends. The next terminal, such as a login's, gets the same number. So
-/// a terminal that is younger than the link to it is not ours. (`systemd/link` has the same rule.)
+/// The kernel removes a terminal when its program ends. The next terminal, for example a login's, gets the same number.
+/// So a terminal that is younger than its link belongs to another program. (`systemd/link` has the same rule.)
 pub fn served(link: &Path) -> Option<Served> {
     let way = follow(link);
     let [.., last_link, device] = &way[..] else { return None };
@@ -79,8 +77,8 @@ pub fn served(link: &Path) -> Option<Served> {
     })
 }
 
-/// The path, and the paths that its links lead through, in order. (The kernel itself does not follow another user's
-/// link in /tmp.)
+/// The path, and each path to which its links lead, in order. (The kernel itself does not follow another user's link in
+/// /tmp.)
 fn follow(link: &Path) -> Vec<PathBuf> {
     let mut way = vec![link.to_owned()];
     while way.len() <= LINKS_MAX
@@ -93,22 +91,22 @@ fn follow(link: &Path) -> Vec<PathBuf> {
     way
 }
 
-/// Whether the program has an order to serve the terminal at another link. Then an earlier program, whose terminal had
-/// the same number, left this link behind.
+/// Whether the program's command line names another link. Then an earlier program, whose terminal had the same number,
+/// left this link behind.
 fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
     let Some(link) = server.arguments.iter().skip_while(|argument| *argument != Path::new("-I")).nth(1) else {
         return false;
     };
     let Ok(folder) = fs::read_link(proc.join(server.pid.to_string()).join("cwd")) else { return false };
     let link = folder.join(link);
-    // Do not compare names: a link has more than one.
+    // Do not compare names: one link may have several.
     let identity = |path: &Path| fs::symlink_metadata(path).ok().map(|about| (about.dev(), about.ino()));
-    // The program may have its terminal, but not its link yet.
+    // The program may have a terminal and no link yet.
     let theirs = identity(&link);
     theirs.is_none() || way.iter().all(|path| identity(path) != theirs)
 }
 
-/// Whether the terminal was made after the link. A later change, such as a new mode, makes it younger too.
+/// Whether the terminal was made after the link. A later change, for example of its mode, also makes it younger.
 fn is_younger(terminal: &Metadata, link: &Metadata) -> bool {
     (terminal.ctime() - YOUNGER_MAX_S, terminal.ctime_nsec()) > (link.mtime(), link.mtime_nsec())
 }
@@ -121,9 +119,9 @@ fn known(process: &Process) -> Option<&'static str> {
         .map(|(_, called)| *called)
 }
 
-/// The program of another user that likely serves the terminal. It is one of the terminal's owner. A program whose
-/// command line names a link on the way to the terminal comes first. The oldest comes next, because a guardian was
-/// started after its program.
+/// The program of another user that likely serves the terminal. It belongs to the terminal's owner. A program whose
+/// command line names a link on the way to the terminal comes first. The oldest one comes next, because a program starts
+/// before its guardian.
 fn hidden_server(proc: &Path, way: &[PathBuf], terminal: &Metadata) -> Option<Process> {
     let is_owner = |process: &Process| {
         fs::metadata(proc.join(process.pid.to_string())).is_ok_and(|about| about.uid() == terminal.uid())
@@ -146,7 +144,7 @@ impl fmt::Display for Served {
             return write!(f, ": remove the link, which another user has made");
         }
         match (program, unit, pid) {
-            // Any user can make a link in /tmp to any terminal, such as the one of root's login.
+            // Any user can make a link in /tmp to any terminal, for example to the terminal of root's login.
             (None, _, Some(_)) => write!(f, ": remove the link, unless that program has made it"),
             (_, Some(unit), Some(_)) => write!(f, ": stop it (sudo systemctl stop {})", foreign::word(unit)),
             (_, None, Some(pid)) => write!(f, ": stop it (sudo kill {pid})"),
@@ -180,7 +178,7 @@ mod tests {
         let pty = openpty(None, None).unwrap();
         let device = ttyname(&pty.slave).unwrap();
         symlink(&device, &own).unwrap();
-        // Klipper's own program does this.
+        // As klipper_mcu does.
         fs::set_permissions(&device, fs::Permissions::from_mode(0o660)).unwrap();
         let found = served(&link).unwrap().to_string();
         let expected = format!("{} leads to {}, which another program serves", link.display(), device.display());
@@ -204,10 +202,10 @@ mod tests {
         for owner in [0, 65_534] {
             std::os::unix::fs::lchown(&link, Some(owner), None).unwrap();
             let found = served(&link).unwrap();
-            let told = Served { program: Some("Pinion"), pid: Some(7), ..found }.to_string();
+            let said = Served { program: Some("Pinion"), pid: Some(7), ..found }.to_string();
             let remedy =
                 if owner == 0 { "stop it (sudo kill 7)" } else { "remove the link, which another user has made" };
-            assert!(told.ends_with(&format!("which Pinion serves (process 7): {remedy}")), "{told}");
+            assert!(said.ends_with(&format!("which Pinion serves (process 7): {remedy}")), "{said}");
         }
     }
 
@@ -220,24 +218,24 @@ mod tests {
     }
 
     #[test]
-    fn what_stops_a_program_is_told() {
+    fn the_command_that_stops_the_program_is_named() {
         let by = |program, unit: Option<&str>, pid| {
             let (link, device) = ("/tmp/klipper_host_mcu".into(), "/dev/pts/3".into());
             let unit = unit.map(str::to_owned);
             Served { link, device, program, pid, unit, is_planted: false }.to_string()
         };
-        let told = |unit, pid| by(Some("Pinion"), unit, pid);
+        let said = |unit, pid| by(Some("Pinion"), unit, pid);
         let begins = "/tmp/klipper_host_mcu leads to /dev/pts/3, which Pinion serves";
         let by_unit = format!("{begins} (process 7): stop it (sudo systemctl stop pinion-mcu)");
-        assert_eq!(told(Some("pinion-mcu"), Some(7)), by_unit);
-        assert_eq!(told(None, Some(7)), format!("{begins} (process 7): stop it (sudo kill 7)"));
-        assert_eq!(told(None, None), format!("{begins}: stop it (sudo pinion doctor may name it)"));
+        assert_eq!(said(Some("pinion-mcu"), Some(7)), by_unit);
+        assert_eq!(said(None, Some(7)), format!("{begins} (process 7): stop it (sudo kill 7)"));
+        assert_eq!(said(None, None), format!("{begins}: stop it (sudo pinion doctor may name it)"));
         // The link is another user's, and the terminal is of root's login.
         for unit in [Some("ssh"), None] {
-            let told = by(None, unit, Some(7));
+            let said = by(None, unit, Some(7));
             assert!(
-                !told.contains("sudo") && told.ends_with("remove the link, unless that program has made it"),
-                "{told}"
+                !said.contains("sudo") && said.ends_with("remove the link, unless that program has made it"),
+                "{said}"
             );
         }
     }

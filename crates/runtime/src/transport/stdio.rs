@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Standard input and output: the host, or a program on the way to it, has started Pinion. Pinion ends with the input.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, IsTerminal};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::{Mutex, PoisonError};

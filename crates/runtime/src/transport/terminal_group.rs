@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The terminal's group: one judgment for the program that gives the terminal to it, and for `pinion run --check`.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 use nix::unistd::{Gid, Group, User, getegid, geteuid, getgroups};

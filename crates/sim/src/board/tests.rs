@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated board in virtual time: the effect of its pins on axes, heaters and fans.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::config::SimConfig;
 use crate::config::tests::example;

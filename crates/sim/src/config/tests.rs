@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The description: the refused values and their errors, and whether its documentation is complete.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 
 /// The error of the default printer with its first `from` replaced by `to`.
@@ -214,16 +212,6 @@ fn corexy_needs_three_homed_axes() {
     }
     let delta = refused(&format!("corexy = true\n{}", example("A delta printer")));
     assert!(delta.contains("remove `[delta]`"), "{delta}");
-}
-
-#[test]
-fn the_place_of_an_axis_follows_from_the_nozzles() {
-    let config = SimConfig::parse(&example("A delta printer"), "delta").unwrap();
-    let flat_mm = (215.0f64.powi(2) - 105.0f64.powi(2)).sqrt();
-    assert!((config.axis_place("b", [0.0, 0.0, 10.0]).unwrap() - flat_mm - 10.0).abs() < 1e-9);
-    assert_eq!(config.axis_place("b", [500.0, 0.0, 0.0]), None);
-    assert_eq!(config.axis_place("extruder", [0.0; 3]), None);
-    assert_eq!(SimConfig::default_printer().axis_place("y", [1.0, 2.0, 3.0]), Some(2.0));
 }
 
 #[test]

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The axes of a description, the bed, and the limits of the motion.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The boards of a description, and the pins in use on them.
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeMap, HashMap};
 
 use serde::{Deserialize, Serialize};

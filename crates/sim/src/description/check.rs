@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The checks for any value, and the error for a wrong value.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashSet;
 
 pub(crate) use pinion_firmware::trouble::Trouble;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The types of descriptions, and their checks. It names neither the engine nor a part.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod axes;
 pub(crate) mod boards;
 pub(crate) mod buses;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The names of pins.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 use serde::{Deserialize, Serialize};

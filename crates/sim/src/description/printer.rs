@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer of a description, and how its axes move the head.
 
-#![forbid(unsafe_code)]
-
 use super::axes::{AxisConfig, BedConfig, CarriageConfig, DeltaConfig, Limits};
 use super::buses::{I2cBusConfig, SpiBusConfig};
 use super::check::{Trouble, there_is};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The rails of a description, and how its motors move them.
 
-#![forbid(unsafe_code)]
-
 use super::axes::{AxisConfig, CarriageConfig, End};
 use super::check::{Trouble, fault};
 use super::pin::PinName;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! An ADC's reading of a temperature: a thermistor's divider, or any other circuit by its curve.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::board::ADC_MAX;
 
 use super::thermistor::Thermistor;

@@ -7,8 +7,6 @@
 //! - its inverse by Cardano's formula
 //! - the divider: `R / (pull-up + R)` of the reference
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::board::ADC_MAX;
 
 /// 0 °C in kelvin.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Checks that the values of a description make a printer. An error names the first wrong value and a remedy.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashSet;
 
 use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Makes the motors and the rails of a description.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::motion::{Axis, Motor, Rail};

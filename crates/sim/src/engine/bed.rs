@@ -4,8 +4,6 @@
 //! Motors hold a cartesian printer's gantry, or its bed, each at its own place. A delta's nozzle hangs on three
 //! carriages. In both cases the distance to the bed follows from the positions of the motors.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::linkage::{Linkage, RAILS_MAX};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Followers read the steps of motors, each with its instant, in their order.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::motion::{Motor, Rail};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A light of several colors, each dimmed by its own pin.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::look::{Colour, Look};

@@ -1,11 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The geometry of kinematics that are not a gantry: where the nozzle is while the rails are at these places, and back.
+//! The geometry of kinematics that are not a gantry: where the nozzle is while the rails are at these places.
 //!
 //! Places are the rails' in klippy's order of axes. The sketches are the same as in `klippy/kinematics/*.py`.
-
-#![forbid(unsafe_code)]
-
-use std::f64::consts::PI;
 
 use crate::description::axes::DeltaConfig;
 use crate::description::kinematics::{RotaryDeltaConfig, WinchConfig};
@@ -88,36 +84,6 @@ impl Linkage {
         }
     }
 
-    /// The places of the rails with the nozzle there. Not a number if it cannot be there.
-    pub(crate) fn places(&self, nozzle_mm: [f64; 3]) -> [f64; RAILS_MAX] {
-        let [x, y, z] = nozzle_mm;
-        let mut places = [0.0; RAILS_MAX];
-        match self {
-            Linkage::Delta { towers_mm, arms_mm } => {
-                for tower in 0..3 {
-                    let [tower_x, tower_y] = towers_mm[tower];
-                    let square = arms_mm[tower].powi(2) - (x - tower_x).powi(2) - (y - tower_y).powi(2);
-                    places[tower] = z + square.sqrt();
-                }
-            }
-            Linkage::Deltesian { arms_mm, arm_x_mm } => {
-                places[0] = z + (arms_mm[0].powi(2) - (x + arm_x_mm[0]).powi(2)).sqrt();
-                places[1] = z + (arms_mm[1].powi(2) - (x - arm_x_mm[1]).powi(2)).sqrt();
-                places[2] = y;
-            }
-            Linkage::Polar => places[..3].copy_from_slice(&[y.atan2(x), x.hypot(y), z]),
-            Linkage::RotaryDelta(config) => {
-                for (arm, place) in places[..3].iter_mut().enumerate() {
-                    *place = shoulder_angle(config, arm, nozzle_mm);
-                }
-            }
-            Linkage::Winch { anchors_mm } => {
-                places.iter_mut().zip(anchors_mm).for_each(|(place, anchor)| *place = distance_mm(*anchor, nozzle_mm));
-            }
-        }
-        places
-    }
-
     /// The way of the nozzle for a step of a rail: at most this much for each millimeter or radian.
     pub(crate) fn leverage_mm(&self, rail: usize, reach_mm: f64) -> f64 {
         match self {
@@ -137,21 +103,6 @@ fn elbow_mm(config: &RotaryDeltaConfig, arm: usize, angle: f64) -> [f64; 3] {
     let (sine, cosine) = config.angles_degrees[arm].to_radians().sin_cos();
     let out = config.shoulder_radius_mm + config.upper_arms_mm[arm] * angle.cos();
     [out * cosine, out * sine, config.shoulder_height_mm + config.upper_arms_mm[arm] * angle.sin()]
-}
-
-/// The angle of an upper arm whose elbow is one lower arm from the nozzle. The elbow points outward.
-fn shoulder_angle(config: &RotaryDeltaConfig, arm: usize, [x, y, z]: [f64; 3]) -> f64 {
-    let (sine, cosine) = config.angles_degrees[arm].to_radians().sin_cos();
-    let aside = y * cosine - x * sine;
-    let (dx, dy) = (x * cosine + y * sine - config.shoulder_radius_mm, z - config.shoulder_height_mm);
-    let (upper, lower) = (config.upper_arms_mm[arm], (config.lower_arms_mm[arm].powi(2) - aside * aside).sqrt());
-    // The triangle of shoulder, elbow and joint.
-    let reach = dx.hypot(dy);
-    let between = ((upper * upper + reach * reach - lower * lower) / (2.0 * upper * reach)).acos();
-    let to_joint = dy.atan2(dx);
-    let angle = to_joint + between;
-    // The joint is below the shoulder and inside of it. Counted this way around, the elbow is outside.
-    if angle > PI { angle - 2.0 * PI } else { angle }
 }
 
 /// The two places at these distances from three joints: the one below first. Arms that cannot join count as stretched.
@@ -181,9 +132,55 @@ fn joined(joints: [[f64; 3]; 3], arms_mm: [f64; 3]) -> [[f64; 3]; 2] {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use std::f64::consts::PI;
+
+    /// The places of the rails with the nozzle there. Not a number if it cannot be there.
+    fn places(linkage: &Linkage, nozzle_mm: [f64; 3]) -> [f64; RAILS_MAX] {
+        let [x, y, z] = nozzle_mm;
+        let mut places = [0.0; RAILS_MAX];
+        match linkage {
+            Linkage::Delta { towers_mm, arms_mm } => {
+                for tower in 0..3 {
+                    let [tower_x, tower_y] = towers_mm[tower];
+                    let square = arms_mm[tower].powi(2) - (x - tower_x).powi(2) - (y - tower_y).powi(2);
+                    places[tower] = z + square.sqrt();
+                }
+            }
+            Linkage::Deltesian { arms_mm, arm_x_mm } => {
+                places[0] = z + (arms_mm[0].powi(2) - (x + arm_x_mm[0]).powi(2)).sqrt();
+                places[1] = z + (arms_mm[1].powi(2) - (x - arm_x_mm[1]).powi(2)).sqrt();
+                places[2] = y;
+            }
+            Linkage::Polar => places[..3].copy_from_slice(&[y.atan2(x), x.hypot(y), z]),
+            Linkage::RotaryDelta(config) => {
+                for (arm, place) in places[..3].iter_mut().enumerate() {
+                    *place = shoulder_angle(config, arm, nozzle_mm);
+                }
+            }
+            Linkage::Winch { anchors_mm } => {
+                places.iter_mut().zip(anchors_mm).for_each(|(place, anchor)| *place = distance_mm(*anchor, nozzle_mm));
+            }
+        }
+        places
+    }
+
+    /// The angle of an upper arm whose elbow is one lower arm from the nozzle. The elbow points outward.
+    fn shoulder_angle(config: &RotaryDeltaConfig, arm: usize, [x, y, z]: [f64; 3]) -> f64 {
+        let (sine, cosine) = config.angles_degrees[arm].to_radians().sin_cos();
+        let aside = y * cosine - x * sine;
+        let (dx, dy) = (x * cosine + y * sine - config.shoulder_radius_mm, z - config.shoulder_height_mm);
+        let (upper, lower) = (config.upper_arms_mm[arm], (config.lower_arms_mm[arm].powi(2) - aside * aside).sqrt());
+        // The triangle of shoulder, elbow and joint.
+        let reach = dx.hypot(dy);
+        let between = ((upper * upper + reach * reach - lower * lower) / (2.0 * upper * reach)).acos();
+        let to_joint = dy.atan2(dx);
+        let angle = to_joint + between;
+        // The joint is below the shoulder and inside of it. Counted this way around, the elbow is outside.
+        if angle > PI { angle - 2.0 * PI } else { angle }
+    }
 
     fn assert_there_and_back(linkage: &Linkage, nozzle_mm: [f64; 3]) -> Result<(), TestCaseError> {
-        let back = linkage.nozzle_mm(&linkage.places(nozzle_mm));
+        let back = linkage.nozzle_mm(&places(linkage, nozzle_mm));
         for i in 0..3 {
             prop_assert!((back[i] - nozzle_mm[i]).abs() < 1e-6, "{linkage:?}: {nozzle_mm:?} {back:?}");
         }
@@ -238,7 +235,7 @@ mod tests {
         };
         for nozzle_mm in [[0.0, 0.0, 0.0], [40.0, -30.0, 10.0], [-60.0, 50.0, 120.0]] {
             for arm in 0..3 {
-                let (ours, its) = (linkage.places(nozzle_mm)[arm], klippy(nozzle_mm, arm));
+                let (ours, its) = (places(&linkage, nozzle_mm)[arm], klippy(nozzle_mm, arm));
                 assert!((ours - its).abs() < 1e-9, "{nozzle_mm:?} {arm}: {ours} {its}");
             }
         }

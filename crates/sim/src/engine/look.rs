@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The appearance of a part: as data for a picture, and as text.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 /// The brightness of each part of a light, 0 to 255.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The elements of every printer: motion and heat, wires and buses, time. It names no part.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod assemble;
 pub(crate) mod bed;
 pub(crate) mod follower;

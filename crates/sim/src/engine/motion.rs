@@ -7,8 +7,6 @@
 //! motors move one rail. On CoreXY each of two motors moves two of them. A rail keeps no place of its own: its place
 //! follows from its motors, so that motors of several boards may move it.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 

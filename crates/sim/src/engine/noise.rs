@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The noise of sensors.
 
-#![forbid(unsafe_code)]
-
 /// Noise with a normal distribution. The same seed gives the same noise.
 #[derive(Clone, Debug)]
 pub struct Noise(u64);

@@ -4,8 +4,6 @@
 //! One thread drives a pin, mostly the core. Any thread may read. Nothing here locks, blocks or allocates: a state
 //! changes only when a pin changes. The reader calculates the exact state between two changes.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::seqlock::Seqlock;

@@ -4,8 +4,6 @@
 //! A recorder reads the tracks of all axes and merges them by the instants of the steps. It joins places that lie on
 //! one line, so that the path of a long print fits in memory. Nothing that it does slows the core.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::bed::Bed;

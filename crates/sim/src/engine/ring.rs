@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A mass that rings on an axis, for parts that feel it, and for people who want to see it.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
@@ -123,7 +121,7 @@ pub struct RingWatch {
 }
 
 impl RingWatch {
-    /// Time between two looks. A head that rings with 200 Hz is looked at ten times in a period.
+    /// Time between two samples. A head that rings with 200 Hz is sampled ten times in a period.
     const EACH: Ticks = Ticks::from_us(500);
     /// The axis stands if its last step was this long ago. It accelerates no longer, so the head only rings.
     const STANDS: Ticks = Ticks::from_ms(3);

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Words that one thread writes and any thread reads, without a lock.
 
-#![forbid(unsafe_code)]
-
 use std::sync::atomic::AtomicU64;
 
 use pinion_sync::seqlock;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated printer's serial ports. RX and TX of a port are on one wire, together with the chips.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;

@@ -2,8 +2,6 @@
 //! The simulated printer's SPI buses: the chips, their chip selects, and a record of the transfers, as a logic analyzer
 //! would make it.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Write as _;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer's time.
 
-#![forbid(unsafe_code)]
-
 use std::cell::Cell;
 use std::sync::Arc;
 use std::thread;

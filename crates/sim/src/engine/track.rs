@@ -4,8 +4,6 @@
 //! The core writes without a lock. Readers on any thread follow at their own pace, each with its own place. A reader
 //! that falls behind by more than the track holds notices it. It then continues where the axis is.
 
-#![forbid(unsafe_code)]
-
 use std::sync::atomic::AtomicU64;
 
 use pinion_firmware::time::Clock;

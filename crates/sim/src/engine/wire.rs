@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The wires at the board's pins, and how the MCU drives and senses them.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -289,59 +287,190 @@ impl Edges for SimEdges {
     }
 }
 
-/// The step input of an axis's driver.
-pub(crate) struct StepPin(pub(crate) Arc<Axis>);
+/// A wire that the MCU drives.
+struct Output<F, D> {
+    describe: String,
+    /// Whether the first level counts as an edge.
+    takes_first: bool,
+    drive: F,
+    dim: D,
+}
 
-impl Wire for StepPin {
+impl<F, D> Wire for Output<F, D>
+where
+    F: Fn(bool, Clock) + Send + Sync,
+    D: Fn(f64, Clock) -> Option<()> + Send + Sync,
+{
     fn kind(&self) -> Kind {
         Kind::Output
     }
 
     fn describe(&self) -> String {
-        format!("step of axis {}", self.0.name)
+        self.describe.clone()
     }
 
-    /// The motor ignores the first level of the line.
-    fn settle(&self, _on: bool, _at: Clock) {}
+    fn settle(&self, on: bool, at: Clock) {
+        if self.takes_first {
+            self.drive(on, at);
+        }
+    }
 
     fn drive(&self, on: bool, at: Clock) {
-        self.0.edge(on, at);
+        (self.drive)(on, at);
     }
+
+    fn dim(&self, share: f64, at: Clock) -> Option<()> {
+        (self.dim)(share, at)
+    }
+}
+
+/// An output that gets each level.
+pub(crate) fn output(describe: String, drive: impl Fn(bool, Clock) + Send + Sync) -> impl Wire {
+    Output { describe, takes_first: true, drive, dim: |_, _| None }
+}
+
+/// An output that gets the edges only.
+pub(crate) fn edges(describe: String, drive: impl Fn(bool, Clock) + Send + Sync) -> impl Wire {
+    Output { describe, takes_first: false, drive, dim: |_, _| None }
+}
+
+/// An output that a hardware PWM may drive, too.
+fn dimmable(
+    describe: String,
+    drive: impl Fn(bool, Clock) + Send + Sync,
+    dim: impl Fn(f64, Clock) + Send + Sync,
+) -> impl Wire {
+    let dim = move |share, at| {
+        dim(share, at);
+        Some(())
+    };
+    Output { describe, takes_first: true, drive, dim }
+}
+
+/// A wire that the MCU senses.
+struct Input<F> {
+    describe: String,
+    level: F,
+}
+
+impl<F: Fn(Clock) -> bool + Send + Sync> Wire for Input<F> {
+    fn kind(&self) -> Kind {
+        Kind::Input
+    }
+
+    fn describe(&self) -> String {
+        self.describe.clone()
+    }
+
+    fn sense(&self, _driven: bool, at: Clock) -> bool {
+        (self.level)(at)
+    }
+}
+
+/// An input with this level.
+pub(crate) fn input(describe: String, level: impl Fn(Clock) -> bool + Send + Sync) -> impl Wire {
+    Input { describe, level }
+}
+
+/// A wire that an ADC measures.
+struct Analog<F> {
+    describe: String,
+    counts: F,
+}
+
+impl<F: Fn(Clock, f64) -> u16 + Send + Sync> Wire for Analog<F> {
+    fn kind(&self) -> Kind {
+        Kind::Analog
+    }
+
+    fn describe(&self) -> String {
+        self.describe.clone()
+    }
+
+    fn counts(&self, at: Clock, noise: f64) -> u16 {
+        (self.counts)(at, noise)
+    }
+}
+
+/// The step input of an axis's driver. The motor ignores the first level of the line.
+pub(crate) fn step_pin(axis: Arc<Axis>) -> impl Wire {
+    edges(format!("step of axis {}", axis.name), move |on, at| axis.edge(on, at))
 }
 
 /// The direction input of an axis's driver.
-pub(crate) struct DirectionPin(pub(crate) Arc<Axis>);
-
-impl Wire for DirectionPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("direction of axis {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.set_forward(on);
-    }
+pub(crate) fn direction_pin(axis: Arc<Axis>) -> impl Wire {
+    output(format!("direction of axis {}", axis.name), move |on, _| axis.set_forward(on))
 }
 
 /// The enable inputs of the drivers at one line.
-pub(crate) struct EnablePin(pub(crate) Vec<Arc<Axis>>);
+pub(crate) fn enable_pin(axes: Vec<Arc<Axis>>) -> impl Wire {
+    let names: Vec<&str> = axes.iter().map(|axis| axis.name.as_str()).collect();
+    output(format!("enable of axis {}", names.join(", ")), move |on, _| {
+        axes.iter().for_each(|axis| axis.set_enabled(on));
+    })
+}
 
-impl Wire for EnablePin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
+/// A rail's endstop.
+pub(crate) fn endstop_pin(rail: Arc<Rail>) -> impl Wire {
+    input(format!("endstop of axis {}", rail.name), move |_| rail.endstop().unwrap_or(false))
+}
 
-    fn describe(&self) -> String {
-        let names: Vec<&str> = self.0.iter().map(|axis| axis.name.as_str()).collect();
-        format!("enable of axis {}", names.join(", "))
-    }
+/// A heater's switch.
+pub(crate) fn heater_pin(heater: Arc<Heater>) -> impl Wire {
+    let dimmed = heater.clone();
+    dimmable(
+        format!("heater {}", heater.name),
+        move |on, at| heater.switch(on, at),
+        move |share, at| dimmed.power(share, at),
+    )
+}
 
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.iter().for_each(|axis| axis.set_enabled(on));
-    }
+/// A heater's thermistor.
+pub(crate) fn thermistor_pin(heater: Arc<Heater>) -> impl Wire {
+    let describe = format!("sensor of heater {}", heater.name);
+    let counts = move |at, noise: f64| {
+        let counts = |sensor: &Sensor| sensor.counts(heater.at(at).sensor_celsius, noise * heater.noise_counts);
+        heater.sensor.as_ref().map_or(0, counts)
+    };
+    Analog { describe, counts }
+}
+
+/// A fan's power switch.
+pub(crate) fn fan_pin(fan: Arc<Fan>) -> impl Wire {
+    let dimmed = fan.clone();
+    dimmable(
+        format!("fan {}", fan.name),
+        move |on, at| fan.switch(Switch::Power, on, at),
+        move |share, at| dimmed.power(share, at),
+    )
+}
+
+/// A fan's enable switch.
+pub(crate) fn fan_enable_pin(fan: Arc<Fan>) -> impl Wire {
+    let dimmed = fan.clone();
+    dimmable(
+        format!("enable of fan {}", fan.name),
+        move |on, at| fan.switch(Switch::Enable, on, at),
+        move |share, at| dimmed.switch(Switch::Enable, share > 0.0, at),
+    )
+}
+
+/// The switch of a light or of another output.
+pub(crate) fn lamp_pin(lamp: Arc<Lamp>) -> impl Wire {
+    let dimmed = lamp.clone();
+    dimmable(lamp.name.clone(), move |on, at| lamp.switch(on, at), move |share, at| dimmed.dim(share, at))
+}
+
+/// An input that stays at one level.
+pub(crate) fn fixed_input(name: String, on: bool) -> impl Wire {
+    input(name, move |_| on)
+}
+
+/// An analog pin at a fixed level.
+pub(crate) fn fixed_analog(describe: String, fraction: f64) -> impl Wire {
+    let max = f64::from(ADC_MAX);
+    // The clamp keeps the value in the range of a u16, so the cast loses nothing.
+    Analog { describe, counts: move |_, _| (fraction * max).round().clamp(0.0, max) as u16 }
 }
 
 /// A line whose level selects parts.
@@ -380,91 +509,6 @@ impl Wire for LevelLine {
     }
 }
 
-/// A rail's endstop.
-pub(crate) struct EndstopPin(pub(crate) Arc<Rail>);
-
-impl Wire for EndstopPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        format!("endstop of axis {}", self.0.name)
-    }
-
-    fn sense(&self, _driven: bool, _at: Clock) -> bool {
-        self.0.endstop().unwrap_or(false)
-    }
-}
-
-/// A heater's switch.
-pub(crate) struct HeaterPin(pub(crate) Arc<Heater>);
-
-impl Wire for HeaterPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("heater {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.switch(on, at);
-    }
-
-    fn dim(&self, share: f64, at: Clock) -> Option<()> {
-        self.0.power(share, at);
-        Some(())
-    }
-}
-
-/// A heater's thermistor.
-pub(crate) struct ThermistorPin(pub(crate) Arc<Heater>);
-
-impl Wire for ThermistorPin {
-    fn kind(&self) -> Kind {
-        Kind::Analog
-    }
-
-    fn describe(&self) -> String {
-        format!("sensor of heater {}", self.0.name)
-    }
-
-    fn counts(&self, at: Clock, noise: f64) -> u16 {
-        let counts = |sensor: &Sensor| sensor.counts(self.0.at(at).sensor_celsius, noise * self.0.noise_counts);
-        self.0.sensor.as_ref().map_or(0, counts)
-    }
-}
-
-/// A fan's power switch or its enable switch.
-pub(crate) struct FanPin(pub(crate) Arc<Fan>, pub(crate) Switch);
-
-impl Wire for FanPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        match self.1 {
-            Switch::Power => format!("fan {}", self.0.name),
-            Switch::Enable => format!("enable of fan {}", self.0.name),
-        }
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.switch(self.1, on, at);
-    }
-
-    fn dim(&self, share: f64, at: Clock) -> Option<()> {
-        match self.1 {
-            Switch::Power => self.0.power(share, at),
-            Switch::Enable => self.0.switch(Switch::Enable, share > 0.0, at),
-        }
-        Some(())
-    }
-}
-
 /// A fan's tachometer.
 pub(crate) struct TachometerPin(pub(crate) Arc<Fan>);
 
@@ -486,48 +530,6 @@ impl Wire for TachometerPin {
     }
 }
 
-/// The switch of a light or of another output.
-pub(crate) struct LampPin(pub(crate) Arc<Lamp>);
-
-impl Wire for LampPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        self.0.name.clone()
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.switch(on, at);
-    }
-
-    fn dim(&self, share: f64, at: Clock) -> Option<()> {
-        self.0.dim(share, at);
-        Some(())
-    }
-}
-
-/// An input that stays at one level.
-pub(crate) struct FixedInput {
-    pub(crate) name: String,
-    pub(crate) on: bool,
-}
-
-impl Wire for FixedInput {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        self.name.clone()
-    }
-
-    fn sense(&self, _driven: bool, _at: Clock) -> bool {
-        self.on
-    }
-}
-
 /// A pin with nothing connected.
 pub(crate) struct FreePin;
 
@@ -546,27 +548,5 @@ impl Wire for FreePin {
 
     fn counts(&self, _at: Clock, _noise: f64) -> u16 {
         ADC_MAX / 2
-    }
-}
-
-/// An analog pin at a fixed level.
-pub(crate) struct FixedAnalog {
-    pub(crate) name: String,
-    pub(crate) fraction: f64,
-}
-
-impl Wire for FixedAnalog {
-    fn kind(&self) -> Kind {
-        Kind::Analog
-    }
-
-    fn describe(&self) -> String {
-        self.name.clone()
-    }
-
-    fn counts(&self, _at: Clock, _noise: f64) -> u16 {
-        let max = f64::from(ADC_MAX);
-        // The clamp keeps the value in the range of a u16, so the cast loses nothing.
-        (self.fraction * max).round().clamp(0.0, max) as u16
     }
 }

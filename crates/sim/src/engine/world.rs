@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Everything that a printer is made of, and what a person sees of it.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::look::Look;

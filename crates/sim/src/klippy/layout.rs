@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer's sections in klippy, and the place of its bed for klippy.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::{self, Display};
 
 use crate::description::heater::HeaterConfig;

@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! klippy's configuration language: how a part writes its sections of printer.cfg.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod layout;
 pub(crate) mod sections;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A printer.cfg while it is written.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::{self, Display, Write};
 
 use super::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};

@@ -8,14 +8,12 @@
 //! way round. The chip shifts out the cell's load at the first clock. Not simulated: other inputs (they read 0), the
 //! temperature sensor, the current sources, the filter of 50 and 60 Hz.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use super::load_cell::{Cell, CellConfig};
-use super::ready::{Conversions, ReadyLine, ReadyPin};
+use super::ready::{Conversions, ReadyLine, ready_pin};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::Trouble;
 use crate::description::pin::PinName;
@@ -74,7 +72,7 @@ impl Part for Ads1220Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let drdy = ReadyLine::new("data ready of ads1220");
-        workshop.wire(Some(&self.drdy_pin), ReadyPin(drdy.clone()));
+        workshop.wire(Some(&self.drdy_pin), ready_pin(drdy.clone()));
         let cell = Cell::new(&self.cell, workshop, self);
         workshop.solder_spi(self, Ads1220::new(cell, drdy, workshop.clock.clone()));
         Ok(())
@@ -135,12 +133,12 @@ impl Ads1220 {
         let rate = RATES[usize::from(second >> 5).min(RATES.len() - 1)][mode];
         let period = f64::from(CLOCK_FREQ) / rate;
         let first = Clock::from_ticks(self.clock.now().ticks() + period as u64);
-        self.set(Conversions { first, period, seen: 0, told: true });
+        self.set(Conversions { first, period, seen: 0, reported: true });
     }
 
     fn set(&mut self, conversions: Conversions) {
         self.conversions = conversions;
-        self.drdy.tell(conversions);
+        self.drdy.set(conversions);
     }
 
     /// Number of finished conversions. In single-shot mode it is at most one.
@@ -168,8 +166,8 @@ impl Ads1220 {
         self.data = data;
         self.left = 3;
         // The line reports a single conversion once.
-        let told = self.registers[1] & 4 != 0;
-        self.set(Conversions { seen: over, told, ..self.conversions });
+        let reported = self.registers[1] & 4 != 0;
+        self.set(Conversions { seen: over, reported, ..self.conversions });
     }
 
     fn command(&mut self, byte: u8) {
@@ -283,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn conversions_come_at_the_rate_of_the_mode_and_each_is_told_once() {
+    fn conversions_come_at_the_rate_of_the_mode_and_each_is_reported_once() {
         let mut bench = Bench::new();
         bench.wait_us(1_000_000);
         assert!(!bench.is_ready(), "it was not started");

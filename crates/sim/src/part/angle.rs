@@ -11,8 +11,6 @@
 //! MT6826S's calibration. Not simulated: noise, the sensors' own delays and filters, faults of the magnet, outputs
 //! other than SPI.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 mod a1333;
@@ -164,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn an_a1333_tells_the_angle_of_the_next_frame() {
+    fn an_a1333_sends_the_angle_of_the_next_frame() {
         let mut chip = A1333::new(shaft(1));
         assert_eq!(transfer(&mut chip, &[0x32, 0]), [0, 0]);
         // Half a turn and 10.24 of 32768.
@@ -174,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn an_as5047d_checks_parities_and_tells_errors_until_they_are_read() {
+    fn an_as5047d_checks_parities_and_reports_errors_until_they_are_read() {
         let mut chip = As5047d::new(shaft(2));
         let mut ask = |frame: u16| {
             let answer = transfer(&mut chip, &frame.to_be_bytes());
@@ -186,7 +184,7 @@ mod tests {
         assert_eq!(ask(0x7fff), 0xa00a, "the one of the frame before");
         // That frame had a wrong parity.
         assert_eq!(ask(0x4001), 0x4000 | 0x8000);
-        assert_eq!(ask(0xc000), 0x4004, "which was told, and is cleared");
+        assert_eq!(ask(0xc000), 0x4004, "which was reported, and is cleared");
         assert_eq!(ask(0xc000), 0x0000);
         // SETTINGS1.
         ask(0x0018);

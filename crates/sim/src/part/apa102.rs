@@ -6,8 +6,6 @@
 //! bits of brightness, and blue, green, red with 8 bits each. Not simulated: each light passes data on half a clock
 //! later, so a host sends ones at the end. Here the last light gets its color with its last bit.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
@@ -18,7 +16,7 @@ use crate::description::check::{Trouble, check_lights, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::look::{Colour, Look};
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Kind, Wire, output};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -65,7 +63,7 @@ impl Part for Apa102Config {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let strip = Arc::new(Strip::new(self));
         workshop.wire(Some(&self.data_pin), DataPin(strip.clone()));
-        workshop.wire(Some(&self.clock_pin), ClockPin(strip.clone()));
+        workshop.wire(Some(&self.clock_pin), clock_pin(strip.clone()));
         workshop.show(strip);
         Ok(())
     }
@@ -163,23 +161,13 @@ impl Wire for DataPin {
 }
 
 /// The clock line.
-struct ClockPin(Arc<Strip>);
-
-impl Wire for ClockPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("clock of lights {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, _at: Clock) {
-        if on && !self.0.clocked.swap(on, Ordering::Relaxed) {
-            self.0.take();
+fn clock_pin(strip: Arc<Strip>) -> impl Wire {
+    output(format!("clock of lights {}", strip.name), move |on, _| {
+        if on && !strip.clocked.swap(on, Ordering::Relaxed) {
+            strip.take();
         }
-        self.0.clocked.store(on, Ordering::Relaxed);
-    }
+        strip.clocked.store(on, Ordering::Relaxed);
+    })
 }
 
 #[cfg(test)]
@@ -194,7 +182,7 @@ mod tests {
 
     fn send(strip: &Arc<Strip>, words: &[u32]) {
         let at = Clock::from_ticks(0);
-        let (data, clock) = (DataPin(strip.clone()), ClockPin(strip.clone()));
+        let (data, clock) = (DataPin(strip.clone()), clock_pin(strip.clone()));
         for bit in words.iter().flat_map(|word| (0..32).rev().map(move |bit| word >> bit & 1 != 0)) {
             data.drive(bit, at);
             clock.drive(true, at);

@@ -12,8 +12,6 @@
 //!
 //! A touch is noticed only when the sensor line is read. A host reads it at each step of a probing move.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -26,7 +24,7 @@ use crate::engine::bed::Bed;
 use crate::engine::look::Look;
 use crate::engine::seqlock::Seqlock;
 use crate::engine::time::seconds;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, input, output};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -95,8 +93,8 @@ impl Part for BltouchConfig {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let probe = Arc::new(Bltouch::new(self, workshop.bed()));
-        workshop.wire(Some(&self.control_pin), ControlPin(probe.clone()));
-        workshop.wire(Some(&self.sensor_pin), SensorPin(probe.clone()));
+        workshop.wire(Some(&self.control_pin), control_pin(probe.clone()));
+        workshop.wire(Some(&self.sensor_pin), sensor_pin(probe.clone()));
         workshop.show(probe);
         Ok(())
     }
@@ -333,39 +331,17 @@ impl Sight for Bltouch {
 }
 
 /// The control line, which takes the servo's pulses.
-struct ControlPin(Arc<Bltouch>);
-
-impl Wire for ControlPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        "control of bltouch".into()
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.control(on, at);
-    }
+fn control_pin(probe: Arc<Bltouch>) -> impl Wire {
+    output("control of bltouch".into(), move |on, at| probe.control(on, at))
 }
 
 /// The sensor line, which reports a touch.
-struct SensorPin(Arc<Bltouch>);
-
-impl Wire for SensorPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        "sensor of bltouch".into()
-    }
-
-    fn sense(&self, _driven: bool, at: Clock) -> bool {
-        let state = self.0.at(at);
-        self.0.state.store(state.words());
-        self.0.output(&state, at)
-    }
+fn sensor_pin(probe: Arc<Bltouch>) -> impl Wire {
+    input("sensor of bltouch".into(), move |at| {
+        let state = probe.at(at);
+        probe.state.store(state.words());
+        probe.output(&state, at)
+    })
 }
 
 #[cfg(test)]
@@ -411,7 +387,7 @@ mod tests {
 
         /// Ten pulses of a servo, in one second.
         fn send(&mut self, width_us: f64) {
-            let control = ControlPin(self.probe.clone());
+            let control = control_pin(self.probe.clone());
             for _ in 0..10 {
                 control.drive(true, self.now);
                 self.wait(width_us * 1e-6);
@@ -422,7 +398,7 @@ mod tests {
         }
 
         fn sensor(&self) -> bool {
-            SensorPin(self.probe.clone()).sense(false, self.now)
+            sensor_pin(self.probe.clone()).sense(false, self.now)
         }
 
         fn seen(&self) -> String {
@@ -459,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_are_told_by_their_widths() {
+    fn commands_are_known_by_their_widths() {
         let mut bench = Bench::new(None);
         for (width_us, seen) in
             [(600.0, "pin up"), (690.0, "pin down"), (1475.0, "pin up"), (610.0, "pin down"), (2190.0, "pin up")]

@@ -2,8 +2,6 @@
 //! The thermometer DS18B20 on the kernel's one-wire bus, after its data sheet (Maxim, DS18B20, "Operation —
 //! Measuring Temperature"): steps of 1/16 of a degree, 750 ms for a conversion.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;

@@ -13,8 +13,6 @@
 //! Simulated: all of this, by the clock. The chip shifts out the cell's load at the first pulse, not at the end of the
 //! conversion before. Channel B is not connected and reads noise. The settling after a change of the gain is omitted.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -27,7 +25,7 @@ use crate::description::printer::Printer;
 use crate::engine::seqlock::Seqlock;
 use crate::engine::spi::{MISO, SpiChip};
 use crate::engine::time::seconds;
-use crate::engine::wire::{ControllerPin, Kind, Wire};
+use crate::engine::wire::{ControllerPin, Kind, Wire, input, output};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
@@ -130,8 +128,8 @@ impl Part for Hx71xConfig {
             workshop.solder_spi(self, OnSpi { chip, clock, bit: 0.0, at: now });
             return Ok(());
         }
-        workshop.wire(self.dout_pin.as_ref(), DoutPin(chip.clone()));
-        workshop.wire(self.sclk_pin.as_ref(), SclkPin(chip));
+        workshop.wire(self.dout_pin.as_ref(), dout_pin(chip.clone()));
+        workshop.wire(self.sclk_pin.as_ref(), sclk_pin(chip));
         Ok(())
     }
 
@@ -263,37 +261,13 @@ impl Hx71x {
 }
 
 /// The data line.
-struct DoutPin(Arc<Hx71x>);
-
-impl Wire for DoutPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        format!("data of {}", self.0.chip.name())
-    }
-
-    fn sense(&self, _driven: bool, at: Clock) -> bool {
-        self.0.data(at)
-    }
+fn dout_pin(chip: Arc<Hx71x>) -> impl Wire {
+    input(format!("data of {}", chip.chip.name()), move |at| chip.data(at))
 }
 
 /// The clock line.
-struct SclkPin(Arc<Hx71x>);
-
-impl Wire for SclkPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("clock of {}", self.0.chip.name())
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.clock(on, at);
-    }
+fn sclk_pin(chip: Arc<Hx71x>) -> impl Wire {
+    output(format!("clock of {}", chip.chip.name()), move |on, at| chip.clock(on, at))
 }
 
 /// The chip on an SPI bus. The bus's bits have this length in ticks. The next bit begins at or after `at`.

@@ -2,8 +2,6 @@
 //! Chips on I2C that only take values: digital potentiometers and drivers of lights. They acknowledge each byte and keep
 //! it. A host may read the registers of an SX1509 back.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};

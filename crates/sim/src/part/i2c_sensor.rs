@@ -6,8 +6,6 @@
 //! ready at once. Not simulated: heaters, alarms, oversampling and filters, a BME280's sleep. The humidity and the pressure
 //! of the air never change.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

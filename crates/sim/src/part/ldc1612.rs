@@ -13,13 +13,11 @@
 //! channel 1 and the sequence of channels, the filter of the input (its register keeps what is written), the time of
 //! the search for the drive current.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::ready::{Conversions, ReadyLine, ReadyPin};
+use super::ready::{Conversions, ReadyLine, ready_pin};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
@@ -174,7 +172,7 @@ impl Part for Ldc1612Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let intb = ReadyLine::new("interrupt of ldc1612");
-        workshop.wire(self.intb_pin.as_ref(), ReadyPin(intb.clone()));
+        workshop.wire(self.intb_pin.as_ref(), ready_pin(intb.clone()));
         let coil = Coil { config: self.clone(), bed: workshop.bed(), noise: workshop.noise(self) };
         workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.clock.clone()));
         Ok(())
@@ -279,10 +277,10 @@ impl Ldc1612 {
             first: Clock::from_ticks(first),
             period: if asleep { 0.0 } else { conversion },
             seen: 0,
-            told: self.get(ERROR_CONFIG) & DRDY_2INT != 0 && self.get(CONFIG) & INTB_DIS == 0,
+            reported: self.get(ERROR_CONFIG) & DRDY_2INT != 0 && self.get(CONFIG) & INTB_DIS == 0,
         };
         self.read = 0;
-        self.intb.tell(self.conversions);
+        self.intb.set(self.conversions);
         if !asleep && self.get(CONFIG) & AUTO_AMP_DIS == 0 {
             // INIT_IDRIVE: the current that the chip found.
             let found = self.coil.config.drive_current << 6;
@@ -336,7 +334,7 @@ impl Ldc1612 {
                 let ready = if over > self.conversions.seen { STATUS_DRDY } else { 0 };
                 let unread = if over > self.read { STATUS_UNREADCONV0 } else { 0 };
                 self.conversions.seen = over;
-                self.intb.tell(self.conversions);
+                self.intb.set(self.conversions);
                 ready | unread
             }
             _ => self.get(address),
@@ -507,7 +505,7 @@ mod tests {
     }
 
     #[test]
-    fn conversions_come_by_its_clock_and_each_is_told_once() {
+    fn conversions_come_by_its_clock_and_each_is_reported_once() {
         let mut bench = Bench::set_up();
         // 5 ms to settle, then 2.5 ms.
         bench.wait_us(7_499);
@@ -515,7 +513,7 @@ mod tests {
         bench.wait_us(2);
         assert!(!bench.intb());
         assert_eq!(bench.read(STATUS), STATUS_DRDY | STATUS_UNREADCONV0);
-        assert!(bench.intb(), "told");
+        assert!(bench.intb(), "reported");
         assert_eq!(bench.read(STATUS), STATUS_UNREADCONV0, "not yet read");
         bench.data();
         assert_eq!(bench.read(STATUS), 0);

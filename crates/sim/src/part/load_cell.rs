@@ -2,8 +2,6 @@
 //! A load cell under the hot end. It bends when the nozzle presses into the bed, or when a weight hangs on it. The
 //! chips that measure it are separate parts.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};

@@ -2,8 +2,6 @@
 //! A wire from the bus's output (MOSI) to its input (MISO): every byte comes back. klippy has no section for a wire.
 //! Tests use their own commands for it.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};

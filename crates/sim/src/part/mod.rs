@@ -2,8 +2,6 @@
 //! The parts. Each is a file with its description, its wires, its behavior and its sections of printer.cfg. A part uses
 //! the engine and the types of descriptions. It uses no other part.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod accelerometer;
 pub(crate) mod ads1220;
 pub(crate) mod angle;

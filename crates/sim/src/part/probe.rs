@@ -2,8 +2,6 @@
 //! A switch beside the nozzle that closes when it touches the bed: an inductive probe, a Klicky, a microswitch. It has
 //! no noise and no hysteresis.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
@@ -11,10 +9,9 @@ use crate::description::check::{Trouble, check_offsets};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, input};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::Clock;
 
 /// The probe's description.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -47,8 +44,7 @@ impl Part for ProbeConfig {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let tip = [self.x_offset_mm, self.y_offset_mm, -self.z_offset_mm];
-        let probe = Probe { bed: workshop.bed(), tip };
-        workshop.wire(Some(&self.pin), probe);
+        workshop.wire(Some(&self.pin), switch(workshop.bed(), tip));
         Ok(())
     }
 
@@ -65,24 +61,9 @@ impl Part for ProbeConfig {
     }
 }
 
-struct Probe {
-    bed: Bed,
-    /// The point of contact, relative to the nozzle.
-    tip: [f64; 3],
-}
-
-impl Wire for Probe {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        "probe".into()
-    }
-
-    fn sense(&self, _driven: bool, _at: Clock) -> bool {
-        self.bed.clearance_mm(self.tip) <= 0.0
-    }
+/// A switch at `tip`, which is the point of contact relative to the nozzle.
+fn switch(bed: Bed, tip: [f64; 3]) -> impl Wire {
+    input("probe".into(), move |_| bed.clearance_mm(tip) <= 0.0)
 }
 
 #[cfg(test)]
@@ -90,6 +71,7 @@ mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
     use crate::engine::motion::Axis;
+    use pinion_firmware::time::Clock;
     use std::sync::Arc;
 
     #[test]
@@ -100,7 +82,7 @@ mod tests {
             axis.set_enabled(true);
         }
         let bed = || Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z.clone()));
-        let probe = Probe { bed: bed(), tip: [-30.0, 10.0, -2.5] };
+        let probe = switch(bed(), [-30.0, 10.0, -2.5]);
         // The nozzle is at 60, 45 and 12 mm.
         let height = bed().height_mm(60.0 - 30.0, 45.0 + 10.0);
         let at_nozzle = bed().height_mm(60.0, 45.0);

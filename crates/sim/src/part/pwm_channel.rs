@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A hardware PWM channel, with an output that it dims.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -98,7 +96,7 @@ mod tests {
     use pinion_firmware::board::PWM_MAX;
 
     #[test]
-    fn a_channel_shows_the_percent_that_klippy_was_told() {
+    fn a_channel_shows_the_percent_that_klippy_set() {
         let channel = PwmChannel { name: "laser".into(), share: AtomicU64::new(0) };
         for percent in 0..=100 {
             // The value that klippy computes (klippy/mcu.py).

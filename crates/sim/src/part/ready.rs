@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A chip that converts by its own clock, and its line, which is low while a conversion waits.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::engine::seqlock::Seqlock;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, input};
 use pinion_firmware::time::Clock;
 
 /// The timing of a chip's conversions.
@@ -19,18 +17,19 @@ pub(crate) struct Conversions {
     /// Number of conversions that no longer wait.
     pub(crate) seen: u64,
     /// Whether the line reports them.
-    pub(crate) told: bool,
+    pub(crate) reported: bool,
 }
 
 impl Conversions {
-    pub(crate) const NONE: Conversions = Conversions { first: Clock::from_ticks(0), period: 0.0, seen: 0, told: false };
+    pub(crate) const NONE: Conversions =
+        Conversions { first: Clock::from_ticks(0), period: 0.0, seen: 0, reported: false };
 
     fn words(self) -> [u64; 4] {
-        [self.first.ticks(), self.period.to_bits(), self.seen, self.told.into()]
+        [self.first.ticks(), self.period.to_bits(), self.seen, self.reported.into()]
     }
 
-    fn of([first, period, seen, told]: [u64; 4]) -> Conversions {
-        Conversions { first: Clock::from_ticks(first), period: f64::from_bits(period), seen, told: told != 0 }
+    fn of([first, period, seen, reported]: [u64; 4]) -> Conversions {
+        Conversions { first: Clock::from_ticks(first), period: f64::from_bits(period), seen, reported: reported != 0 }
     }
 
     /// Number of finished conversions.
@@ -52,29 +51,18 @@ impl ReadyLine {
         Arc::new(ReadyLine { name, conversions: Seqlock::new(Conversions::NONE.words()) })
     }
 
-    pub(crate) fn tell(&self, conversions: Conversions) {
+    pub(crate) fn set(&self, conversions: Conversions) {
         self.conversions.store(conversions.words());
     }
 
     /// The level of the line.
     pub(crate) fn level(&self, at: Clock) -> bool {
         let conversions = Conversions::of(self.conversions.load());
-        !conversions.told || conversions.over(at) <= conversions.seen
+        !conversions.reported || conversions.over(at) <= conversions.seen
     }
 }
 
-pub(crate) struct ReadyPin(pub(crate) Arc<ReadyLine>);
-
-impl Wire for ReadyPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        self.0.name.into()
-    }
-
-    fn sense(&self, _driven: bool, at: Clock) -> bool {
-        self.0.level(at)
-    }
+/// The pin at the line.
+pub(crate) fn ready_pin(line: Arc<ReadyLine>) -> impl Wire {
+    input(line.name.into(), move |at| line.level(at))
 }

@@ -5,8 +5,6 @@
 //! turn. A servo without pulses stays where it is. Not simulated: the load, and a refresh rate that is too low or too
 //! high.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -19,7 +17,7 @@ use crate::description::printer::Printer;
 use crate::engine::look::Look;
 use crate::engine::seqlock::Seqlock;
 use crate::engine::time::seconds;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, output};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -86,7 +84,7 @@ impl Part for ServoConfig {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let servo = Arc::new(Servo::new(self, workshop.clock.now()));
-        workshop.wire(Some(&self.pin), PulsePin(servo.clone()));
+        workshop.wire(Some(&self.pin), pulse_pin(servo.clone()));
         workshop.show(servo);
         Ok(())
     }
@@ -158,20 +156,8 @@ impl Sight for Servo {
 }
 
 /// The servo's input.
-struct PulsePin(Arc<Servo>);
-
-impl Wire for PulsePin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("pulse of {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.0.edge(on, at);
-    }
+fn pulse_pin(servo: Arc<Servo>) -> impl Wire {
+    output(format!("pulse of {}", servo.name), move |on, at| servo.edge(on, at))
 }
 
 #[cfg(test)]
@@ -190,7 +176,7 @@ mod tests {
             degrees_per_s: 300.0,
         };
         let servo = Arc::new(Servo::new(&config, Clock::EPOCH));
-        let pin = PulsePin(servo.clone());
+        let pin = pulse_pin(servo.clone());
         let at = |us: f64| Clock::from_ticks((us * f64::from(CLOCK_FREQ) / 1e6) as u64);
         let pulses = |first: u32, width_us: f64| {
             for n in first..first + 50 {

@@ -2,8 +2,6 @@
 //! Digital potentiometers and DACs on SPI: AD5206 (Analog Devices, rev. D: 11 bits, the channel and its value) and
 //! DAC084S085 (TI: 16 bits). They send nothing.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};

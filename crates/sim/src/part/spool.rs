@@ -4,8 +4,6 @@
 //! Simulated: a filament that moves with the extruder's axis, forward and backward. It ends after a length. It can be
 //! stuck from a length on, so that the extruder grinds it. A pin stands for the person who inserts a new spool.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 
@@ -16,10 +14,9 @@ use crate::description::check::{Bound, Trouble, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, edges, input};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::Clock;
 
 /// The spool's description.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -71,9 +68,9 @@ impl Part for SpoolConfig {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(axis) = workshop.axis(&self.axis) {
             let spool = Arc::new(Spool::new(self, axis));
-            workshop.wire(self.switch_pin.as_ref(), SwitchPin(spool.clone()));
-            workshop.wire(self.encoder_pin.as_ref(), EncoderPin(spool.clone()));
-            workshop.wire(self.refill_pin.as_ref(), RefillPin(spool));
+            workshop.wire(self.switch_pin.as_ref(), switch_pin(spool.clone()));
+            workshop.wire(self.encoder_pin.as_ref(), encoder_pin(spool.clone()));
+            workshop.wire(self.refill_pin.as_ref(), refill_pin(spool));
         }
         Ok(())
     }
@@ -138,64 +135,30 @@ impl Spool {
     }
 }
 
-struct SwitchPin(Arc<Spool>);
-
-impl Wire for SwitchPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        format!("filament switch of spool {}", self.0.name)
-    }
-
-    fn sense(&self, _driven: bool, _at: Clock) -> bool {
-        self.0.moved_mm() < self.0.length_mm
-    }
+fn switch_pin(spool: Arc<Spool>) -> impl Wire {
+    input(format!("filament switch of spool {}", spool.name), move |_| spool.moved_mm() < spool.length_mm)
 }
 
-struct EncoderPin(Arc<Spool>);
-
-impl Wire for EncoderPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        format!("filament encoder of spool {}", self.0.name)
-    }
-
-    fn sense(&self, _driven: bool, _at: Clock) -> bool {
-        (self.0.moved_mm() / self.0.encoder_mm).floor() as i64 & 1 == 1
-    }
+fn encoder_pin(spool: Arc<Spool>) -> impl Wire {
+    input(format!("filament encoder of spool {}", spool.name), move |_| {
+        (spool.moved_mm() / spool.encoder_mm).floor() as i64 & 1 == 1
+    })
 }
 
-/// The person who inserts a new spool.
-struct RefillPin(Arc<Spool>);
-
-impl Wire for RefillPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("refill of spool {}", self.0.name)
-    }
-
-    /// A pin that is high from the start inserts nothing.
-    fn settle(&self, _on: bool, _at: Clock) {}
-
-    fn drive(&self, on: bool, _at: Clock) {
+/// The person who inserts a new spool. A pin that is high from the start inserts nothing.
+fn refill_pin(spool: Arc<Spool>) -> impl Wire {
+    edges(format!("refill of spool {}", spool.name), move |on, _| {
         if on {
-            self.0.refill();
+            spool.refill();
         }
-    }
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use pinion_firmware::time::Clock;
 
     /// A spool of 50 mm, and the axis that pulls it.
     struct Bench {
@@ -222,7 +185,7 @@ mod tests {
 
         /// The switch and the number of encoder changes after each move. A move is in mm, with 100 steps per mm.
         fn feed(&self, moves: &[i32]) -> Vec<(bool, u32)> {
-            let (switch, encoder) = (SwitchPin(self.spool.clone()), EncoderPin(self.spool.clone()));
+            let (switch, encoder) = (switch_pin(self.spool.clone()), encoder_pin(self.spool.clone()));
             let now = Clock::EPOCH;
             let feed = |mm: &i32| {
                 self.axis.set_forward(*mm > 0);
@@ -254,7 +217,7 @@ mod tests {
     #[test]
     fn a_new_spool_is_as_long_as_the_first() {
         let bench = Bench::new(None);
-        let refill = RefillPin(bench.spool.clone());
+        let refill = refill_pin(bench.spool.clone());
         refill.settle(true, Clock::EPOCH);
         assert_eq!(bench.feed(&[60]), [(false, 25)]);
         refill.drive(false, Clock::EPOCH);

@@ -10,8 +10,6 @@
 //! line, the status byte. Not simulated: scrolling, contrast, oscillator and voltages, other wirings of the COM
 //! outputs. The memory starts as noise, as in a real chip.
 
-#![forbid(unsafe_code)]
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -25,7 +23,7 @@ use crate::engine::i2c::I2cChip;
 use crate::engine::look::Look;
 use crate::engine::noise::Noise;
 use crate::engine::spi::SpiChip;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Wire, output};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -85,8 +83,8 @@ impl Part for Ssd1306Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let panel = Arc::new(Panel::new(&self.name, workshop.noise(self)));
-        workshop.wire(self.dc_pin.as_ref(), ModePin(panel.clone()));
-        workshop.wire(self.reset_pin.as_ref(), ResetPin(panel.clone()));
+        workshop.wire(self.dc_pin.as_ref(), mode_pin(panel.clone()));
+        workshop.wire(self.reset_pin.as_ref(), reset_pin(panel.clone()));
         match self.dc_pin {
             Some(_) => workshop.solder_spi(self, OnSpi(panel.clone())),
             None => workshop.solder_i2c(self, OnI2c { panel: panel.clone(), control: None }),
@@ -382,40 +380,18 @@ impl SpiChip for OnSpi {
 }
 
 /// D/C.
-struct ModePin(Arc<Panel>);
-
-impl Wire for ModePin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("D/C of {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.is_data.store(on, Ordering::Relaxed);
-    }
+fn mode_pin(panel: Arc<Panel>) -> impl Wire {
+    output(format!("D/C of {}", panel.name), move |on, _| panel.is_data.store(on, Ordering::Relaxed))
 }
 
 /// The reset line.
-struct ResetPin(Arc<Panel>);
-
-impl Wire for ResetPin {
-    fn kind(&self) -> Kind {
-        Kind::Output
-    }
-
-    fn describe(&self) -> String {
-        format!("reset of {}", self.0.name)
-    }
-
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.held.store(!on, Ordering::Relaxed);
+fn reset_pin(panel: Arc<Panel>) -> impl Wire {
+    output(format!("reset of {}", panel.name), move |on, _| {
+        panel.held.store(!on, Ordering::Relaxed);
         if !on {
-            self.0.was_reset.store(true, Ordering::Relaxed);
+            panel.was_reset.store(true, Ordering::Relaxed);
         }
-    }
+    })
 }
 
 #[cfg(test)]
@@ -536,18 +512,18 @@ mod tests {
     }
 
     #[test]
-    fn on_spi_a_line_tells_commands_from_data_and_the_reset_line_resets() {
+    fn on_spi_a_line_separates_commands_from_data_and_the_reset_line_resets() {
         let mut bench = Bench::started();
         let at = Clock::from_ticks(0);
         let mut spi = OnSpi(bench.panel.clone());
-        ModePin(bench.panel.clone()).drive(false, at);
+        mode_pin(bench.panel.clone()).drive(false, at);
         for byte in [0xb1, 0x20, 2] {
             spi.exchange(byte);
         }
-        ModePin(bench.panel.clone()).drive(true, at);
+        mode_pin(bench.panel.clone()).drive(true, at);
         spi.exchange(0xb1);
         assert_eq!(bench.bright(), [(0, 8), (0, 12), (0, 13), (0, 15)]);
-        let reset = ResetPin(bench.panel.clone());
+        let reset = reset_pin(bench.panel.clone());
         reset.drive(false, at);
         bench.write(START);
         assert_eq!(bench.look(), "dark", "held in its reset");

@@ -7,8 +7,6 @@
 //! resistor follows the equation of Callendar and Van Dusen (IEC 60751). Not simulated: noise, averaging, the cold
 //! junction's limits and offset, the MAX31865's fault detection cycle.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -471,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn the_max31856_converts_once_it_is_told_and_has_limits() {
+    fn the_max31856_converts_on_command_and_has_limits() {
         let mut bench = Bench::new(Max31856, 100.5, None);
         bench.wait_ms(200);
         assert_eq!(bench.transfer(&[0; 17])[1..], MAX31856_REGISTERS);
@@ -486,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn the_max31856_looks_for_an_open_wire_only_if_it_is_told_to() {
+    fn the_max31856_looks_for_an_open_wire_only_if_that_is_on() {
         let mut bench = Bench::new(Max31856, 200.0, Some(SensorFault::Open));
         bench.transfer(&[0x80, 0x80]);
         bench.wait_ms(100);

@@ -11,15 +11,16 @@
 //! with a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep, temperatures and faults, the automatic tuning of
 //! StealthChop, the pulse generator (VACTUAL), INDEX, and the effects of the OTP memory.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
+use super::trinamic::registers::{
+    CHOPCONF, DRV_STATUS, GCONF, IFCNT, MSCNT, MSCURACT, PWM_AUTO, Registers, SG_RESULT, SGTHRS, SLAVECONF, TCOOLTHRS,
+    TPWMTHRS, TSTEP, UART_IOIN as IOIN,
+};
 use super::trinamic::{
-    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
-    offer_sensorless_homing,
+    FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
 use super::uart::{HOST, PortUart, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
 use super::workshop::{Part, Socket, Workshop};
@@ -32,26 +33,6 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
-const GCONF: u8 = 0x00;
-const GSTAT: u8 = 0x01;
-const IFCNT: u8 = 0x02;
-const SLAVECONF: u8 = 0x03;
-const IOIN: u8 = 0x06;
-const IHOLD_IRUN: u8 = 0x10;
-const TSTEP: u8 = 0x12;
-const TPWMTHRS: u8 = 0x13;
-const TCOOLTHRS: u8 = 0x14;
-const SGTHRS: u8 = 0x40;
-const SG_RESULT: u8 = 0x41;
-const MSCNT: u8 = 0x6a;
-const MSCURACT: u8 = 0x6b;
-const CHOPCONF: u8 = 0x6c;
-const DRV_STATUS: u8 = 0x6f;
-const PWMCONF: u8 = 0x70;
-const PWM_AUTO: u8 = 0x72;
-
-/// FCLKTRIM as the factory wrote it to the chip.
-const OTP: u32 = 0x0f;
 /// IOIN: VERSION, and the level of PDN_UART, which is high after a message.
 const VERSION: u32 = 0x21 << 24;
 const VERSION_2208: u32 = 0x20 << 24;
@@ -59,7 +40,6 @@ const PDN_UART: u32 = 1 << 6;
 const GCONF_EN_SPREADCYCLE: u32 = 1 << 2;
 const GCONF_SHAFT: u32 = 1 << 3;
 const GCONF_MSTEP_REG_SELECT: u32 = 1 << 7;
-const CHOPCONF_DEDGE: u32 = 1 << 29;
 
 /// SG_RESULT of a free motor; the full load makes it 0. The data sheet gives no formula.
 const SG_FREE: u32 = 250;
@@ -69,60 +49,6 @@ const SG_MARGIN: u32 = 100;
 const SG_MAX: u32 = 511;
 /// The SGTHRS at which a fifth of the full load counts as a stall.
 const SGTHRS_FOR_HOMING: u32 = 100;
-
-use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
-
-/// An address without a register reads as zero.
-const REGISTERS: &[Register] = &[
-    Register(GCONF, RW, 10, 0x0000_0101),
-    Register(GSTAT, C, 3, 0x0000_0001),
-    Register(IFCNT, R, 8, 0), // computed
-    Register(SLAVECONF, W, 12, 0),
-    Register(0x04, W, 16, 0),    // OTP_PROG: is done in a factory, not here
-    Register(0x05, R, 24, OTP),  // OTP_READ
-    Register(IOIN, R, 32, 0),    // computed
-    Register(0x07, RW, 10, OTP), // FACTORY_CONF: starts as the OTP has it
-    Register(IHOLD_IRUN, W, 20, 0x0001_1f10),
-    Register(0x11, W, 8, 20),  // TPOWERDOWN
-    Register(TSTEP, R, 20, 0), // computed
-    Register(TPWMTHRS, W, 20, 0),
-    Register(TCOOLTHRS, W, 20, 0),
-    Register(0x22, W, 24, 0), // VACTUAL
-    Register(SGTHRS, W, 8, 0),
-    Register(SG_RESULT, R, 10, 0), // computed
-    Register(0x42, W, 16, 0),      // COOLCONF
-    Register(MSCNT, R, 10, 0),     // computed
-    Register(MSCURACT, R, 25, 0),  // computed
-    Register(CHOPCONF, RW, 32, 0x1000_0053),
-    Register(DRV_STATUS, R, 32, 0), // computed
-    Register(PWMCONF, RW, 32, 0xc10d_0024),
-    Register(0x71, R, 25, 0),     // PWM_SCALE
-    Register(PWM_AUTO, R, 24, 0), // computed
-];
-
-/// The registers of a TMC2208 (data sheet rev. 1.13, "Register Map").
-const REGISTERS_2208: &[Register] = &[
-    Register(GCONF, RW, 10, 0x0000_0101),
-    Register(GSTAT, C, 3, 0x0000_0001),
-    Register(IFCNT, R, 8, 0), // computed
-    Register(SLAVECONF, W, 12, 0),
-    Register(0x04, W, 16, 0),    // OTP_PROG: is done in a factory, not here
-    Register(0x05, R, 24, OTP),  // OTP_READ
-    Register(IOIN, R, 32, 0),    // computed
-    Register(0x07, RW, 10, OTP), // FACTORY_CONF: starts as the OTP has it
-    Register(IHOLD_IRUN, W, 20, 0x0001_1f10),
-    Register(0x11, W, 8, 20),  // TPOWERDOWN
-    Register(TSTEP, R, 20, 0), // computed
-    Register(TPWMTHRS, W, 20, 0),
-    Register(0x22, W, 24, 0),     // VACTUAL
-    Register(MSCNT, R, 10, 0),    // computed
-    Register(MSCURACT, R, 25, 0), // computed
-    Register(CHOPCONF, RW, 32, 0x1000_0053),
-    Register(DRV_STATUS, R, 32, 0), // computed
-    Register(PWMCONF, RW, 32, 0xc10d_0024),
-    Register(0x71, R, 25, 0),     // PWM_SCALE
-    Register(PWM_AUTO, R, 24, 0), // computed
-];
 
 /// A driver TMC2209.
 pub type Tmc2209Config = UartDriverConfig<2209>;
@@ -275,7 +201,7 @@ struct Tmc2209 {
 impl Tmc2209 {
     /// The driver of an axis, at power-up.
     fn new(name: &str, model: u16, (address, sg_free): (u8, u32), axis: Arc<Axis>) -> Tmc2209 {
-        let registers = Registers::new(if model == 2208 { REGISTERS_2208 } else { REGISTERS });
+        let registers = Registers::of(model);
         let rule = stall_rule(&registers, sg_free, 0);
         let diag = Arc::new(StallOutput::new(name.to_owned(), axis.clone(), rule));
         let mut chip = Tmc2209 { model, address, sg_free, motor: Motor::new(axis), diag, registers, written: 0 };
@@ -286,7 +212,7 @@ impl Tmc2209 {
     /// Applies the registers.
     fn set_up(&mut self) {
         let mres = if self.registers.is_set(GCONF, GCONF_MSTEP_REG_SELECT) {
-            self.registers.get(CHOPCONF) >> 24 & 0xf
+            self.registers.mres()
         } else {
             // 8, 32, 64 and 16 microsteps by MS1 and MS2; 8, 2, 4 and 16 of a TMC2208.
             let by_pins = if self.model == 2208 { [5, 7, 6, 4] } else { [5, 3, 2, 4] };
@@ -319,11 +245,9 @@ impl Tmc2209 {
             DRV_STATUS => {
                 let spread = self.registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
                 let stealth = !spread && self.motor.tstep(now) >= self.registers.get(TPWMTHRS);
-                let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
-                u32::from(stands) << 31 | u32::from(stealth) << 30 | current << 16
+                u32::from(stands) << 31 | u32::from(stealth) << 30 | self.registers.current(stands) << 16
             }
-            // PWM_GRAD and PWM_OFS, from which the tuning starts.
-            PWM_AUTO => (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff,
+            PWM_AUTO => self.registers.pwm_auto(),
             _ => self.registers.read(address),
         }
     }
@@ -333,7 +257,7 @@ impl Tmc2209 {
         self.registers.write(address, data);
         self.set_up();
         if address == CHOPCONF {
-            self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
+            self.motor.axis.set_both_edges(self.registers.has_both_edges());
         }
     }
 }
@@ -393,6 +317,7 @@ fn stall_rule(registers: &Registers, sg_free: u32, mres: u32) -> StallRule {
 
 #[cfg(test)]
 mod tests {
+    use super::super::trinamic::registers::{GSTAT, IHOLD_IRUN};
     use super::*;
     use crate::description::default::DefaultPrinter;
     use crate::engine::wire::Wire;

@@ -6,8 +6,6 @@
 //! the status. Simulated: the registers that a host writes, the microstep counter, StallGuard's value and standstill. Not
 //! simulated: CoolStep's current, faults, SG_TST. The motor turns as with a TMC5160 (`tmc5160.rs`).
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};

@@ -14,15 +14,16 @@
 //! Not simulated: CoolStep, temperatures and faults, the automatic tuning of StealthChop, and the ramp generator
 //! and encoder (their registers keep what is written).
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::trinamic::registers::{
+    CHOPCONF, COOLCONF, DRV_STATUS, GCONF, GSTAT, MSCNT, MSCURACT, MSLUT, MSLUTSEL, MSLUTSTART, PWM_AUTO, Registers,
+    SPI_IOIN as IOIN, TCOOLTHRS, TPWMTHRS, TSTEP,
+};
 use super::trinamic::{
-    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
-    offer_sensorless_homing,
+    FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
@@ -39,26 +40,6 @@ const MODE: u8 = 3;
 const DATAGRAM_BYTES: usize = 5;
 const WRITE: u8 = 0x80;
 
-const GCONF: u8 = 0x00;
-const GSTAT: u8 = 0x01;
-const IOIN: u8 = 0x04;
-const IHOLD_IRUN: u8 = 0x10;
-const TSTEP: u8 = 0x12;
-const TPWMTHRS: u8 = 0x13;
-const TCOOLTHRS: u8 = 0x14;
-const MSLUT: u8 = 0x60;
-const MSLUTSEL: u8 = 0x68;
-const MSLUTSTART: u8 = 0x69;
-const MSCNT: u8 = 0x6a;
-const MSCURACT: u8 = 0x6b;
-const CHOPCONF: u8 = 0x6c;
-const COOLCONF: u8 = 0x6d;
-const DRV_STATUS: u8 = 0x6f;
-const PWMCONF: u8 = 0x70;
-const PWM_AUTO: u8 = 0x72;
-
-/// FCLKTRIM as the factory wrote it to the chip.
-const OTP: u32 = 0x0f;
 /// IOIN: VERSION, and SD_MODE, which is wired high for the step and direction mode.
 const VERSION: u32 = 0x30 << 24;
 const VERSION_2130: u32 = 0x11 << 24;
@@ -70,7 +51,6 @@ const GCONF_SHAFT: u32 = 1 << 4;
 const GCONF_DIAG_STALL: [u32; 2] = [1 << 7, 1 << 8];
 const GCONF_DIAG_PUSHPULL: [u32; 2] = [1 << 12, 1 << 13];
 const GSTAT_DRV_ERR: u32 = 1 << 1;
-const CHOPCONF_DEDGE: u32 = 1 << 29;
 const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
 
 /// SG_RESULT of a free motor with SGT at 0, its decrease at full load, and its increase with each step of SGT. These
@@ -80,161 +60,6 @@ const SG_FALL: i32 = 300;
 const SG_PER_SGT: i32 = 10;
 /// Longest chain of drivers.
 const CHAIN_MAX: usize = 32;
-
-use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
-
-/// An address without a register reads as zero.
-const REGISTERS: &[Register] = &[
-    Register(GCONF, RW, 18, 0x0000_0008),
-    Register(GSTAT, C, 3, 0x0000_0001),
-    Register(0x02, R, 8, 0),            // IFCNT: of the UART, which is not in use
-    Register(0x03, W, 12, 0),           // SLAVECONF
-    Register(IOIN, R, 32, 0),           // computed
-    Register(0x05, W, 32, 0),           // X_COMPARE
-    Register(0x06, W, 16, 0),           // OTP_PROG: is done in a factory, not here
-    Register(0x07, R, 8, OTP),          // OTP_READ
-    Register(0x08, RW, 5, OTP),         // FACTORY_CONF: starts as the OTP has it
-    Register(0x09, W, 19, 0x0001_0606), // SHORT_CONF
-    Register(0x0a, W, 22, 0x0008_0400), // DRV_CONF
-    Register(0x0b, W, 8, 0),            // GLOBALSCALER
-    Register(0x0c, R, 16, 0),           // OFFSET_READ
-    Register(IHOLD_IRUN, W, 20, 0),
-    Register(0x11, W, 8, 10),  // TPOWERDOWN
-    Register(TSTEP, R, 20, 0), // computed
-    Register(TPWMTHRS, W, 20, 0),
-    Register(TCOOLTHRS, W, 20, 0),
-    Register(0x15, W, 20, 0),           // THIGH
-    Register(0x20, RW, 2, 0),           // RAMPMODE
-    Register(0x21, RW, 32, 0),          // XACTUAL
-    Register(0x22, R, 24, 0),           // VACTUAL
-    Register(0x23, W, 18, 0),           // VSTART
-    Register(0x24, W, 16, 0),           // A1
-    Register(0x25, W, 20, 0),           // V1
-    Register(0x26, W, 16, 0),           // AMAX
-    Register(0x27, W, 23, 0),           // VMAX
-    Register(0x28, W, 16, 0),           // DMAX
-    Register(0x2a, W, 16, 0),           // D1
-    Register(0x2b, W, 18, 1),           // VSTOP
-    Register(0x2c, W, 16, 0),           // TZEROWAIT
-    Register(0x2d, RW, 32, 0),          // XTARGET
-    Register(0x33, W, 23, 0),           // VDCMIN
-    Register(0x34, RW, 12, 0),          // SW_MODE
-    Register(0x35, C, 14, 0),           // RAMP_STAT
-    Register(0x36, R, 32, 0),           // XLATCH
-    Register(0x38, RW, 11, 0),          // ENCMODE
-    Register(0x39, RW, 32, 0),          // X_ENC
-    Register(0x3a, W, 32, 0x0001_0000), // ENC_CONST
-    Register(0x3b, C, 2, 0),            // ENC_STATUS
-    Register(0x3c, R, 32, 0),           // ENC_LATCH
-    Register(0x3d, W, 20, 0),           // ENC_DEVIATION
-    Register(MSLUT, W, 32, 0xaaaa_b554),
-    Register(0x61, W, 32, 0x4a95_54aa), // MSLUT1 to 7
-    Register(0x62, W, 32, 0x2449_2929),
-    Register(0x63, W, 32, 0x1010_4222),
-    Register(0x64, W, 32, 0xfbff_ffff),
-    Register(0x65, W, 32, 0xb5bb_777d),
-    Register(0x66, W, 32, 0x4929_5556),
-    Register(0x67, W, 32, 0x0040_4222),
-    Register(MSLUTSEL, W, 32, 0xffff_8056),
-    Register(MSLUTSTART, W, 24, 0x00f7_0000),
-    Register(MSCNT, R, 10, 0),    // computed
-    Register(MSCURACT, R, 25, 0), // computed
-    Register(CHOPCONF, RW, 32, 0x1041_0150),
-    Register(COOLCONF, W, 25, 0),
-    Register(0x6e, W, 24, 0),       // DCCTRL
-    Register(DRV_STATUS, R, 32, 0), // computed
-    Register(PWMCONF, W, 32, 0xc40c_001e),
-    Register(0x71, R, 25, 0),     // PWM_SCALE
-    Register(PWM_AUTO, R, 24, 0), // computed
-    Register(0x73, R, 20, 0),     // LOST_STEPS: counts in DcStep mode only
-];
-
-/// The registers of a TMC2130 (data sheet rev. 1.15, "Register Mapping").
-const REGISTERS_2130: &[Register] = &[
-    Register(GCONF, RW, 18, 0),
-    Register(GSTAT, C, 3, 0x0000_0001),
-    Register(IOIN, R, 32, 0), // computed
-    Register(IHOLD_IRUN, W, 20, 0),
-    Register(0x11, W, 8, 0),   // TPOWERDOWN
-    Register(TSTEP, R, 20, 0), // computed
-    Register(TPWMTHRS, W, 20, 0),
-    Register(TCOOLTHRS, W, 20, 0),
-    Register(0x15, W, 20, 0),  // THIGH
-    Register(0x2d, RW, 32, 0), // XDIRECT
-    Register(0x33, W, 23, 0),  // VDCMIN
-    Register(MSLUT, W, 32, 0xaaaa_b554),
-    Register(0x61, W, 32, 0x4a95_54aa), // MSLUT1 to 7
-    Register(0x62, W, 32, 0x2449_2929),
-    Register(0x63, W, 32, 0x1010_4222),
-    Register(0x64, W, 32, 0xfbff_ffff),
-    Register(0x65, W, 32, 0xb5bb_777d),
-    Register(0x66, W, 32, 0x4929_5556),
-    Register(0x67, W, 32, 0x0040_4222),
-    Register(MSLUTSEL, W, 32, 0xffff_8056),
-    Register(MSLUTSTART, W, 24, 0x00f7_0000),
-    Register(MSCNT, R, 10, 0),    // computed
-    Register(MSCURACT, R, 25, 0), // computed
-    Register(CHOPCONF, RW, 32, 0),
-    Register(COOLCONF, W, 25, 0),
-    Register(0x6e, W, 24, 0),       // DCCTRL
-    Register(DRV_STATUS, R, 32, 0), // computed
-    Register(PWMCONF, W, 22, 0x0005_0480),
-    Register(0x71, R, 8, 0),  // PWM_SCALE
-    Register(0x72, W, 2, 0),  // ENCM_CTRL
-    Register(0x73, R, 20, 0), // LOST_STEPS: counts in DcStep mode only
-];
-
-/// The registers of a TMC2240 (Analog Devices, TMC2240, rev. 2: "Register Map").
-const REGISTERS_2240: &[Register] = &[
-    Register(GCONF, RW, 18, 0x0000_0008),
-    Register(GSTAT, C, 5, 0x0000_0001),
-    Register(0x02, R, 8, 0),             // IFCNT: of the UART, which is not in use
-    Register(0x03, W, 12, 0),            // NODECONF
-    Register(IOIN, R, 32, 0),            // computed
-    Register(0x0a, RW, 22, 0x0000_0020), // DRV_CONF
-    Register(0x0b, RW, 8, 0),            // GLOBAL_SCALER
-    Register(IHOLD_IRUN, RW, 28, 0x0407_0a03),
-    Register(0x11, RW, 8, 10), // TPOWERDOWN
-    Register(TSTEP, R, 20, 0), // computed
-    Register(TPWMTHRS, RW, 20, 0),
-    Register(TCOOLTHRS, RW, 20, 0),
-    Register(0x15, RW, 20, 0),           // THIGH
-    Register(0x2d, RW, 32, 0),           // DIRECT_MODE
-    Register(0x38, RW, 11, 0),           // ENCMODE
-    Register(0x39, RW, 32, 0),           // X_ENC
-    Register(0x3a, W, 32, 0x0001_0000),  // ENC_CONST
-    Register(0x3b, C, 1, 0),             // ENC_STATUS
-    Register(0x3c, R, 32, 0),            // ENC_LATCH
-    Register(0x50, R, 29, ADC_24_V),     // ADC_VSUPPLY_AIN
-    Register(0x51, R, 29, ADC_35_C),     // ADC_TEMP
-    Register(0x52, RW, 29, 0x0b92_0f25), // OTW_OV_VTH
-    Register(MSLUT, RW, 32, 0xaaaa_b554),
-    Register(0x61, RW, 32, 0x4a95_54aa), // MSLUT1 to 7
-    Register(0x62, RW, 32, 0x2449_2929),
-    Register(0x63, RW, 32, 0x1010_4222),
-    Register(0x64, RW, 32, 0xfbff_ffff),
-    Register(0x65, RW, 32, 0xb5bb_777d),
-    Register(0x66, RW, 32, 0x4929_5556),
-    Register(0x67, RW, 32, 0x0040_4222),
-    Register(MSLUTSEL, RW, 32, 0xffff_8056),
-    Register(MSLUTSTART, RW, 32, 0x00f7_0000),
-    Register(MSCNT, R, 10, 0),    // computed
-    Register(MSCURACT, R, 25, 0), // computed
-    Register(CHOPCONF, RW, 32, 0x1041_0150),
-    Register(COOLCONF, RW, 25, 0),
-    Register(DRV_STATUS, R, 32, 0), // computed
-    Register(PWMCONF, RW, 32, 0xc44c_001e),
-    Register(0x71, R, 25, 0),     // PWM_SCALE
-    Register(PWM_AUTO, R, 24, 0), // computed
-    Register(0x74, RW, 10, 0),    // SG4_THRS
-    Register(0x75, R, 10, 0),     // SG4_RESULT
-    Register(0x76, R, 32, 0),     // SG4_IND
-];
-
-/// ADC_VSUPPLY: 9.732 mV for each count.
-const ADC_24_V: u32 = 2466;
-/// ADC_TEMP: (count - 2038) / 7.7 degrees Celsius.
-const ADC_35_C: u32 = 2308;
 
 /// A driver TMC5160.
 pub type Tmc5160Config = SpiDriverConfig<5160>;
@@ -361,11 +186,7 @@ struct Tmc5160 {
 impl Tmc5160 {
     /// The driver of an axis, at power-up.
     fn new(name: String, (model, sg_free): (u16, i32), axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
-        let registers = Registers::new(match model {
-            2130 => REGISTERS_2130,
-            2240 => REGISTERS_2240,
-            _ => REGISTERS,
-        });
+        let registers = Registers::of(model);
         let diag = [0, 1]
             .map(|pin| Arc::new(StallOutput::new(name.clone(), axis.clone(), stall_rule(&registers, sg_free, pin))));
         let motor = Motor::new(axis);
@@ -375,8 +196,7 @@ impl Tmc5160 {
     }
 
     fn set_up_motor(&mut self) {
-        let reversed = self.registers.is_set(GCONF, GCONF_SHAFT);
-        self.motor.set_up(self.registers.get(CHOPCONF) >> 24 & 0xf, reversed);
+        self.motor.set_up(self.registers.mres(), self.registers.is_set(GCONF, GCONF_SHAFT));
     }
 
     /// The value that a host reads.
@@ -402,10 +222,7 @@ impl Tmc5160 {
                 self.motor.currents(&Wave { increments, segments, start })
             }
             DRV_STATUS => self.drv_status(now),
-            // PWM_GRAD and PWM_OFS, from which the tuning starts.
-            PWM_AUTO if self.model != 2130 => {
-                (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff
-            }
+            PWM_AUTO if self.model != 2130 => self.registers.pwm_auto(),
             _ => self.registers.read(address),
         }
     }
@@ -414,7 +231,7 @@ impl Tmc5160 {
         self.registers.write(address, data);
         if matches!(address, GCONF | CHOPCONF) {
             self.set_up_motor();
-            self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
+            self.motor.axis.set_both_edges(self.registers.has_both_edges());
         }
         for (pin, diag) in self.diag.iter().enumerate() {
             diag.set(stall_rule(&self.registers, self.sg_free, pin));
@@ -425,8 +242,7 @@ impl Tmc5160 {
         let tstep = self.motor.tstep(now);
         let stands = tstep == STANDSTILL;
         let stealth = self.registers.is_set(GCONF, GCONF_EN_PWM_MODE) && tstep >= self.registers.get(TPWMTHRS);
-        let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
-        let mut status = u32::from(stands) << 31 | current << 16 | u32::from(stealth) << 14;
+        let mut status = u32::from(stands) << 31 | self.registers.current(stands) << 16 | u32::from(stealth) << 14;
         // Only SpreadCycle measures the load.
         if !stealth && !stands {
             let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
@@ -463,7 +279,7 @@ fn stall_rule(registers: &Registers, sg_free: i32, pin: usize) -> StallRule {
         least_load: (is_set(GCONF_DIAG_STALL[pin]) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
         fastest: 0,
         slowest: registers.get(TCOOLTHRS).min(stealth_from.saturating_sub(1)),
-        mres: (registers.get(CHOPCONF) >> 24 & 0xf).min(8),
+        mres: registers.mres().min(8),
         push_pull: is_set(GCONF_DIAG_PUSHPULL[pin]),
     }
 }
@@ -509,6 +325,7 @@ impl SpiChip for Tmc5160 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::trinamic::registers::{ADC_35_C, IHOLD_IRUN, OTP, PWMCONF};
     use super::*;
     use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::{CLOCK_FREQ, VirtualClock};
@@ -662,7 +479,7 @@ mod tests {
         bench.axis.set_forward(true);
         bench.steps(3, 1);
         assert_eq!(bench.axis.position_steps(), start + 3);
-        bench.write(CHOPCONF, 0x1041_0150 | CHOPCONF_DEDGE);
+        bench.write(CHOPCONF, 0x1041_0150 | 1 << 29);
         bench.steps(3, 1);
         assert_eq!(bench.axis.position_steps(), start + 9);
     }

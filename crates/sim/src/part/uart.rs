@@ -3,8 +3,6 @@
 //! Interface"). The other end is two lines or one, and the chip hears their edges. Or it is a serial port, and the chip
 //! hears bytes.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, TryLockError};
 
 use crate::engine::serial::SerialChip;

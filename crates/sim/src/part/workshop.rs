@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The interface between a part and the rest of the printer, and the place where the printer is assembled.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex};
 
 use super::uart::Uart;

@@ -9,8 +9,6 @@
 //! A pulse outside the data sheet's tolerance counts as the nearer value. The display of the colors mentions these
 //! pulses, because real strips differ in how they read them.
 
-#![forbid(unsafe_code)]
-
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
@@ -327,8 +325,8 @@ mod tests {
             bench.pulses(std::iter::repeat_n(pulse, 24));
             bench.wait_us(1000);
             let light = if one { "#ffffff" } else { "off" };
-            let told = format!(" ({odd} pulses are not the data sheet's)");
-            assert_eq!(bench.look(), format!("{light}{}", if odd > 0 { &told } else { "" }), "{pulse:?}");
+            let odd_pulses = format!(" ({odd} pulses are not the data sheet's)");
+            assert_eq!(bench.look(), format!("{light}{}", if odd > 0 { &odd_pulses } else { "" }), "{pulse:?}");
         }
     }
 

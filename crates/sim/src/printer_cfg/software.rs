@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Sections without hardware of their own, offered for trying their G-codes.
 
-#![forbid(unsafe_code)]
-
 use crate::klippy::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};
 use crate::klippy::sections::Sections;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The sections of the documentation's examples.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::config::tests::example;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The path that a G-code file asks for, read as klippy reads it.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::TAU;
 use std::io::{BufRead, Read};
 
@@ -304,7 +302,7 @@ mod tests {
         ];
         assert_eq!(found, expected);
         assert_eq!(path.filament_mm, 6.0);
-        // A macro with a number, a macro of one letter, and what klippy refuses.
+        // A macro with a number, a macro of one letter, and lines that klippy refuses.
         for line in ["PARK2 X5", "Z", "G 1 X5", "1G1 X5", "_G1 X5"] {
             let path = parse(&format!("G1X1Y1Z1\n{line}\nG1X2")).unwrap();
             let last = path.points.last().map(|last| (last.nozzle_mm, last.is_start));

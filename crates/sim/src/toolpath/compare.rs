@@ -6,8 +6,6 @@
 //! the file, and each point of the file is on one line of the motors' path. The sum of all squared distances is as
 //! small as it can be. The greatest distance of two lines is at an end of one of them, so the points are enough.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeMap;
 
 use super::asked::{AskedPath, AskedPoint};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The path as a drawing: layers seen from above, colored by speed.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Write};
 
 use super::{Line, lines, runs};

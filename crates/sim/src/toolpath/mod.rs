@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Exports of a recorded path, and a comparison with the G-code that asked for it.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod asked;
 pub(crate) mod compare;
 pub(crate) mod drawing;

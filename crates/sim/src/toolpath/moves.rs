@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The path as G-code.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Write};
 
 use super::lines;

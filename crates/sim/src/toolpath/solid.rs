@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The laid filament as a body.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Write};
 
 use super::{FILAMENT_MM2, Line, STEPS_OFF, distance, nearest, runs};

@@ -12,6 +12,7 @@ use pinion_firmware::shutdown::{Shutdown, reason};
 mod bench;
 mod devices;
 mod lines;
+mod plain;
 mod workers;
 
 pub use bench::{
@@ -21,6 +22,7 @@ pub use bench::{
 use bench::{ANALOGS, I2C_BUSES, PWMS, SERIALS, SPI_BUSES};
 use devices::{FakeAdc, FakeI2c, FakePwm, FakeSerial, FakeSpi, FakeThermometer};
 use lines::{FakeBank, FakeEdges, FakeLine};
+pub use plain::PlainBoard;
 pub use workers::FakeWorkers;
 
 /// The chip that has the lines that may sleep.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A bus, or a device on it, kept the host's commands waiting.
 
-#![forbid(unsafe_code)]
-
 use super::evidence::{Job, MS, Record, Span};
 use super::{Culprit, Judgment, span_text};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program died or hangs.
 
-#![forbid(unsafe_code)]
-
 use super::bus::of_hanging;
 use super::evidence::Record;
 use super::processors::of_core;

@@ -3,8 +3,6 @@
 //!
 //! Times are ticks after the stop, so that those before it are negative. Spans are ticks.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::time::Clock;
 use pinion_protocol::block::Refusal;
 

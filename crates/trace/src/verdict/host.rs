@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host or the wire to it was late: its block, or the refresh of an output.
 
-#![forbid(unsafe_code)]
-
 use crate::file::SSH;
 
 use super::bus::of_bus;

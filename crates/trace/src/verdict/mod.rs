@@ -5,8 +5,6 @@
 //! block came, and ends with the stop. Whoever took at least half of this span is the culprit. Without evidence against
 //! anybody the verdict says what is known, and accuses nobody.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::Ticks;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The power supply or heat slowed the computer down.
 
-#![forbid(unsafe_code)]
-
 use crate::event::PowerFault;
 
 use super::evidence::{Record, Span};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The core or the link did not get to its work: processors, drivers, too much work.
 
-#![forbid(unsafe_code)]
-
 use crate::event::Watched;
 
 use super::evidence::{MS, QUIET, Record, Scheduling, Span};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Nothing ran: the program was stopped, or the whole computer.
 
-#![forbid(unsafe_code)]
-
 use super::evidence::{Record, Span};
 use super::{Culprit, Judgment, span_text};
 

@@ -80,8 +80,8 @@ fn all_edges_are_counted_and_the_last_one_dated() {
     for count in [2, 16, 18, 400] {
         let (before, after) = edges(&sim, count);
         expected += count;
-        let (told, clock) = settled(client);
-        assert_eq!(told, expected);
+        let (reported, clock) = settled(client);
+        assert_eq!(reported, expected);
         // Tick 0 is a whole second of CLOCK_MONOTONIC.
         let ns = u64::from(clock) * 20 % 1_000_000_000;
         let since = (ns + 1_000_000_000 - u64::from(before.subsec_nanos())) % 1_000_000_000;
@@ -96,7 +96,7 @@ fn a_fan_of_20_000_rpm_is_measured() {
     let (sim, _program, mut client) = counting(USUAL);
     let client = &mut client;
     settled(client);
-    let told: Vec<(u32, u32)> = thread::scope(|scope| {
+    let reported: Vec<(u32, u32)> = thread::scope(|scope| {
         // Two pulses per turn give 1333 edges per second.
         scope.spawn(|| {
             let began = Instant::now();
@@ -107,12 +107,12 @@ fn a_fan_of_20_000_rpm_is_measured() {
         });
         (0..6).map(|_| next(client)).collect()
     });
-    for pair in told[1..].windows(2) {
+    for pair in reported[1..].windows(2) {
         let (count, ticks) = (pair[1].0 - pair[0].0, pair[1].1 - pair[0].1);
         let rpm = f64::from(count) / 4.0 * 60.0 * 50e6 / f64::from(ticks);
         println!("{rpm:.0} rpm");
         // As exact as the test's own sleep.
-        assert!((rpm - 20_000.0).abs() < 400.0, "{rpm}: {told:?}");
+        assert!((rpm - 20_000.0).abs() < 400.0, "{rpm}: {reported:?}");
     }
 }
 

@@ -381,12 +381,12 @@ fn pulses_at_an_expander_are_polled() {
     run(client, &format!("query_counter oid=0 clock={at} poll_ticks=1000000 sample_ticks=5000000"));
     let mut count = |expected: i64| {
         client.drain();
-        let mut told = None;
+        let mut answer = None;
         for _ in 0..2 {
             let until = Instant::now() + Duration::from_secs(10);
-            told = client.wait("counter_state", Some(0), until).expect("a session");
+            answer = client.wait("counter_state", Some(0), until).expect("a session");
         }
-        assert_eq!(told.expect("a state").int("count").expect("a count"), expected);
+        assert_eq!(answer.expect("a state").int("count").expect("a count"), expected);
     };
     count(0);
     expander.set_inputs(1 << 2);
@@ -430,8 +430,8 @@ fn configure_inputs(client: &mut Client, expander: &Expander) {
 /// Failed calls of the expander's lines, and their retries.
 fn missed(program: &Program) -> (u64, u64) {
     let link = program.link().to_str().expect("a path");
-    let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
-    let status: serde_json::Value = serde_json::from_slice(&told.stdout).expect("a status");
+    let answer = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+    let status: serde_json::Value = serde_json::from_slice(&answer.stdout).expect("a status");
     let lines = status["lines"].as_array().expect("lines").iter();
     let counts: Vec<_> = lines.map(|line| &line["bus"]).filter(|bus| !bus.is_null()).collect();
     assert_eq!(counts.len(), 4, "{status:#}");

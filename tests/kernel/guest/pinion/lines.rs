@@ -234,8 +234,8 @@ fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
     let late = GpioSim::builder("late", 8).name(3, "LAMP").build();
     configure(&mut program.connect(), 1, &[output(0, "LAMP")]);
     let link = program.link().to_str().expect("a path");
-    let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
-    let status: serde_json::Value = serde_json::from_slice(&told.stdout).expect("a status");
+    let answer = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+    let status: serde_json::Value = serde_json::from_slice(&answer.stdout).expect("a status");
     let names = ["LAMP".to_owned(), "late/gpio3".to_owned(), format!("{}/gpio3", late.chip_name())];
     let pin = status["lines"][0]["pin"].as_str().expect("a line");
     assert!(names.iter().any(|name| name == pin), "{status}");

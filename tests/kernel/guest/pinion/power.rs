@@ -41,7 +41,7 @@ fn verdict_over_a_late_host() -> String {
 }
 
 #[test]
-fn a_stop_at_a_low_voltage_is_told_with_the_voltage() {
+fn a_stop_at_a_low_voltage_is_reported_with_the_voltage() {
     let _firmware = Firmware::load();
     assert!(verdict_over_a_late_host().contains("look at the host's load"));
     sysfs::write("/sys/module/mock_firmware/parameters/throttled", UNDERVOLTAGE);

@@ -57,8 +57,8 @@ fn a_number_that_no_chip_has_means_the_header_until_a_chip_has_it() {
     configure(&mut client, 1, &[OUTPUT]);
     run(&mut client, "update_digital_out oid=0 value=1");
     assert!(other.level(17), "it means the chip with this number, as ever");
-    let told = program.log().matches("this kernel has no gpiochip0").count();
-    assert_eq!(told, 1, "the log says so once");
+    let warnings = program.log().matches("this kernel has no gpiochip0").count();
+    assert_eq!(warnings, 1, "the log says so once");
 }
 
 #[test]

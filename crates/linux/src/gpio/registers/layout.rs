@@ -104,7 +104,7 @@ mod tests {
     /// A chip as its data sheet has it, with the world outside its pins.
     struct Model {
         layout: Layout,
-        /// Each word of the block. A register that sets or clears bits has none of its own.
+        /// Each word of the block. A register that sets or clears bits has no word of its own.
         words: Vec<AtomicU32>,
         /// Levels from outside, by the bank of the level registers. They count where the chip drives nothing.
         outside: [AtomicU32; 3],
@@ -353,7 +353,7 @@ mod tests {
                         assert_eq!(model.kernel_gets(18), round % 2 == 0, "and so does the kernel's");
                     }
                 });
-                // The driver turns a line of the same function register meanwhile.
+                // The driver turns another line of the same function register at that moment.
                 scope.spawn(move || {
                     (0..5_000).for_each(|_| {
                         model.kernel_turns(16, None);

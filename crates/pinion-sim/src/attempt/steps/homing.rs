@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Homing, and the second carriage of a printer with two.
 
-#![forbid(unsafe_code)]
-
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial, coordinates, travel};
@@ -67,7 +65,7 @@ fn is_plain(trial: &Trial<'_>) -> bool {
         && trial.kinematics().is_some_and(|kinematics| simple.contains(&kinematics))
 }
 
-/// Moves the second carriage, and looks where its motor is.
+/// Moves the second carriage, and checks where its motor is.
 pub(super) fn second_carriage(trial: &mut Trial<'_>) -> Seen {
     let Some(section) = trial.config().section("dual_carriage") else {
         return skipped("there is no [dual_carriage]");

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Leveling with a probe, and the calibration of the probe.
 
-#![forbid(unsafe_code)]
-
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, Trial, travel};
 

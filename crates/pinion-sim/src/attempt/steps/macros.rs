@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The macros that begin and end a print.
 
-#![forbid(unsafe_code)]
-
 use super::heaters::heat;
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;

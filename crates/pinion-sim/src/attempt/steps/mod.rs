@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The steps of `--try`, a file for each thing that an owner checks.
 //!
-//! A step is one command or a few, and looks at the printer, not only at klippy: where the motors put the nozzle, how
+//! A step is one command or a few, and checks the printer, not only klippy: where the motors put the nozzle, how
 //! hot the heater is, how fast the fan turns.
-
-#![forbid(unsafe_code)]
 
 mod heaters;
 mod homing;

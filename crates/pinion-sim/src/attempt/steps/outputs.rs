@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Fans, lights and servos do what a command says.
 
-#![forbid(unsafe_code)]
-
 use std::thread;
 use std::time::{Duration, Instant};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A print, and the path of the nozzle against the file.
 
-#![forbid(unsafe_code)]
-
 use std::io::BufReader;
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;

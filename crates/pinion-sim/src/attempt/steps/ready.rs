@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! klippy starts and knows every MCU.
 
-#![forbid(unsafe_code)]
-
 use super::Seen;
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::Trial;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The input shaper of a printer with an accelerometer.
 
-#![forbid(unsafe_code)]
-
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, Trial};
 use crate::own::{Kind, kind_of};

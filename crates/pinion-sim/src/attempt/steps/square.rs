@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The G-code of a small print in the middle of any bed.
 
-#![forbid(unsafe_code)]
-
 use std::fmt::Write as _;
 
 /// Half a side of the square, if the bed is larger than that.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! klippy's command line: its folder, its configuration and its API server.
 
-#![forbid(unsafe_code)]
-
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 

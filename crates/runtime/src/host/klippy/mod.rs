@@ -2,8 +2,6 @@
 //! Facts about a Klipper host, found from outside: its process, the messages that its sources look up, and so the
 //! dialect that it speaks.
 
-#![forbid(unsafe_code)]
-
 use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -236,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn git_tells_the_commit() {
+    fn git_knows_the_commit() {
         let folder = tempfile::tempdir().unwrap();
         let git = folder.path().join(".git");
         let put = |path: &str, text: &str| {
@@ -276,7 +274,7 @@ mod tests {
 
     /// With checkouts of real hosts in KLIPPER_DIR_V0_11 and so on.
     #[test]
-    fn real_hosts_are_told_apart() {
+    fn real_hosts_are_distinguished() {
         for dialect in DialectName::OF_HOSTS {
             let variable = format!("KLIPPER_DIR_{}", dialect.name().to_uppercase().replace('.', "_"));
             let Some(folder) = std::env::var_os(&variable) else {

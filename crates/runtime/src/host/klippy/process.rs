@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Processes in /proc (proc(5)): command lines, users, units and paths as the process sees them.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::io;

@@ -9,8 +9,6 @@
 //!                                     " rest_ticks=%u")
 //! ```
 
-#![forbid(unsafe_code)]
-
 use std::collections::{BTreeSet, VecDeque};
 use std::fs;
 use std::io::{self, Read};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The process that has a terminal open, found through /proc (proc(5)).
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::io;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};

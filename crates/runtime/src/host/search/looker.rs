@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The search's process. It answers one question after the other until the program is gone.
 
-#![forbid(unsafe_code)]
-
 use std::ffi::CStr;
 use std::fs;
 use std::io;

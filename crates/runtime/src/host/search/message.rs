@@ -5,8 +5,6 @@
 //! The search reads files that a host has written. So the program trusts none of its messages: [`Answer::decode`] takes
 //! nothing that is too long or not an answer.
 
-#![forbid(unsafe_code)]
-
 use serde::{Deserialize, Serialize};
 
 use crate::host::klippy::terminal::Terminal;
@@ -133,9 +131,9 @@ mod tests {
             let host = FoundHost { pid, is_sure, is_attach: is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
             let line = || Line { is_warning: is_sure, text: text.clone() };
             let lines = (0..lines).map(|_| line()).collect();
-            let told = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };
+            let sent = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };
             // Anything may come over the socket.
-            let heard = Answer::decode(&serde_json::to_vec(&told).unwrap()).unwrap();
+            let heard = Answer::decode(&serde_json::to_vec(&sent).unwrap()).unwrap();
             prop_assert_eq!(heard.dialect(), DialectName::Union);
             heard.assert_bounded();
         }

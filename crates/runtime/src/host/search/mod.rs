@@ -9,8 +9,6 @@
 //!
 //! This file is the program's side. `looker.rs` is the process. `message.rs` has the messages between them.
 
-#![forbid(unsafe_code)]
-
 mod looker;
 mod message;
 

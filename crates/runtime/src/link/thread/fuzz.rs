@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The link between any host and any core, for `fuzz/`. There are no threads: bytes choose each side's next action.
 
-#![forbid(unsafe_code)]
-
 use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;

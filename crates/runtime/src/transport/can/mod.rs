@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A CAN bus, by the protocol of Klipper's own firmware. The frames of a host carry the bytes of its blocks, eight in
+//! A CAN bus, by the protocol of Klipper's C. The frames of a host carry the bytes of its blocks, eight in
 //! each, and so do ours. `node.rs` has the protocol, and this file the socket.
-
-#![forbid(unsafe_code)]
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -430,7 +428,7 @@ mod tests {
     use socketcan::{CanRemoteFrame, ExtendedId};
 
     #[test]
-    fn error_frames_tell_the_state_of_the_bus() {
+    fn error_frames_show_the_state_of_the_bus() {
         let active = CanState::Active;
         assert_eq!(state(CRTL, 0x08, active), CanState::Warn);
         assert_eq!(state(CRTL, 0x04 | 0x10, active), CanState::Passive);

@@ -2,8 +2,6 @@
 //! How a node gets its nodeid, and how it understands a frame (docs/CANBUS_protocol.md and src/generic/canserial.c of
 //! Klipper). No socket is needed for that.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;

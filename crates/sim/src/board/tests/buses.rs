@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated board's buses in virtual time: which chips listen, and which answer.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::catalog::PartConfig;
 use crate::part::tmc2209::Tmc2209Config;

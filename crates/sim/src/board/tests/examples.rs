@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The documentation's examples in virtual time; lights and the edges of a tachometer.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::config::tests::example;
 use crate::engine::bed::{BedShape, Space};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The recorder in virtual time.
 
-#![forbid(unsafe_code)]
-
 use super::*;
 use crate::description::default::DefaultPrinter;
 use crate::engine::bed::Bed;

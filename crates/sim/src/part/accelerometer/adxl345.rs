@@ -7,8 +7,6 @@
 //! sleep and self test, the trigger mode (it works like the stream mode) and the interrupt pins (INT_SOURCE has the
 //! same bits).
 
-#![forbid(unsafe_code)]
-
 use super::Chip;
 use super::head::{Fifo, Head, Room};
 

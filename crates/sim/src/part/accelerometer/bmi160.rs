@@ -5,8 +5,6 @@
 //! registers hold what is written. Not simulated: gyroscope, headers, filters, interrupts, the choice of the bus by its
 //! first message.
 
-#![forbid(unsafe_code)]
-
 use super::Chip;
 use super::head::{Fifo, Head, Room, value};
 

@@ -7,8 +7,6 @@
 //! since the sample before, which is the difference of two speeds. This simulates the chip's own low-pass. Without it
 //! the steps, far above the sampling rate, would appear as beats.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 use std::sync::Arc;
 

@@ -5,8 +5,6 @@
 //! Simulated: all registers; rates, ranges and resolutions, the FIFO and its status. Not simulated: filters, self test,
 //! interrupts and the events that cause them, single conversions, the temperature.
 
-#![forbid(unsafe_code)]
-
 use super::Chip;
 use super::head::{Fifo, Head, Room, value};
 

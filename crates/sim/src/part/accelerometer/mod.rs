@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Accelerometers on a head that rings: their descriptions, and how a host's bytes reach their registers.
 
-#![forbid(unsafe_code)]
-
 mod adxl345;
 mod bmi160;
 mod head;

@@ -5,8 +5,6 @@
 //! Simulated: identification, sleep, rates, ranges, the FIFO with accelerations alone, its count and its overflow. Other
 //! registers hold what is written. Not simulated: gyroscope, magnetometer, temperature, filters, interrupts.
 
-#![forbid(unsafe_code)]
-
 use super::Chip;
 use super::head::{Fifo, Head, Room, value};
 

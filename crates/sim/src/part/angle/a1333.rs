@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A1333 (Allegro, "SPI Interface").
 
-#![forbid(unsafe_code)]
-
 use super::shaft::{Frame, Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! AS5047D (ams, v1-10, "SPI Interface").
 
-#![forbid(unsafe_code)]
-
 use super::shaft::{Frame, Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! MT6816 (MagnTek, rev. 1.3, "SPI Interface").
 
-#![forbid(unsafe_code)]
-
 use super::shaft::{Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 

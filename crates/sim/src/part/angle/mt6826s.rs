@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! MT6826S (MagnTek, rev. 1.1, "SPI Interface").
 
-#![forbid(unsafe_code)]
-
 use super::shaft::{Shaft, crc8};
 use crate::engine::spi::SpiChip;
 

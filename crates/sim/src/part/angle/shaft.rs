@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A motor's shaft with a magnet, and the common parts of several sensors' frames.
 
-#![forbid(unsafe_code)]
-
 use std::f64::consts::TAU;
 use std::sync::Arc;
 

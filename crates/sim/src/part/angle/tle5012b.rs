@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! TLE5012B (Infineon, V2.1 and its user's manual, "SSC Data Transfer").
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::shaft::{Shaft, crc8};

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The common part of Trinamic's stepper drivers: registers, the microstep counter and its wave, the time between
-//! steps, and StallGuard's output.
+//! The common part of Trinamic's stepper drivers: registers (`registers.rs`), the microstep counter and its wave, the
+//! time between steps, and StallGuard's output.
 //!
 //! StallGuard measures how far the load turns the rotor back from the field. Here a free motor has no load. A motor
 //! that drives against the end of its axis has a load that grows with each lost step. It reaches the full torque after
 //! a full step. So the measured value follows each step. In the real chips it follows each full step only.
 
-#![forbid(unsafe_code)]
+pub(crate) mod registers;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,70 +27,10 @@ const FULL_STEP: u64 = 256;
 /// The load of a stalled motor.
 pub(crate) const FULL_LOAD: u32 = 1000;
 
-/// The host's access to a register.
-#[derive(Clone, Copy, PartialEq)]
-pub(crate) enum Access {
-    /// It reads as zero.
-    Write,
-    Read,
-    ReadWrite,
-    /// A written one clears its bit.
-    ReadClear,
-}
-
-/// A register: its address, access, bits, and value at power-up.
-pub(crate) struct Register(pub(crate) u8, pub(crate) Access, pub(crate) u32, pub(crate) u32);
-
-/// A chip's registers, as the host has set them. An address that is not in the table reads as zero.
-pub(crate) struct Registers {
-    table: &'static [Register],
-    values: [u32; 128],
-}
-
-impl Registers {
-    pub(crate) fn new(table: &'static [Register]) -> Registers {
-        let mut values = [0; 128];
-        for Register(address, _, _, value) in table {
-            values[usize::from(*address)] = *value;
-        }
-        Registers { table, values }
-    }
-
-    pub(crate) fn get(&self, address: u8) -> u32 {
-        self.values[usize::from(address & 0x7f)]
-    }
-
-    pub(crate) fn is_set(&self, address: u8, bit: u32) -> bool {
-        self.get(address) & bit != 0
-    }
-
-    fn find(&self, address: u8) -> Option<&'static Register> {
-        self.table.iter().find(|register| register.0 == address)
-    }
-
-    /// The value that the host reads, if it is the stored value.
-    pub(crate) fn read(&self, address: u8) -> u32 {
-        match self.find(address) {
-            None | Some(Register(_, Access::Write, ..)) => 0,
-            Some(_) => self.get(address),
-        }
-    }
-
-    pub(crate) fn write(&mut self, address: u8, data: u32) {
-        let Some(Register(_, access, bits, _)) = self.find(address) else { return };
-        let value = &mut self.values[usize::from(address)];
-        match access {
-            Access::Read => {}
-            Access::Write | Access::ReadWrite => *value = data & (u32::MAX >> (32 - bits)),
-            Access::ReadClear => *value &= !data,
-        }
-    }
-}
-
 /// Says in a driver's section that klippy can run without the section.
 pub(crate) fn may_be_left_out(cfg: &mut Sections) {
     cfg.comment("The motor turns without this section, too. When you take it out, start Pinion anew: the chip");
-    cfg.comment("keeps what it was told, and then takes each pulse for two steps.");
+    cfg.comment("keeps its settings, and then takes each pulse for two steps.");
 }
 
 /// Offers the sections for homing by the driver instead of the endstop: the axis then moves until it hits its end.
@@ -321,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_is_told_while_the_motor_drives_against_its_end_within_the_velocities() {
+    fn a_stall_is_reported_while_the_motor_drives_against_its_end_within_the_velocities() {
         let mut config = DefaultPrinter::read();
         config.axes[0].start_mm = 0.0;
         config.axes[0].overtravel_mm = 0.0;
