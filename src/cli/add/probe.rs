@@ -556,8 +556,8 @@ mod tests {
     fn the_simulated_printer_s_chips_are_known() {
         let mut chips = Simulated::with(|described| {
             described.replace(
-                "kind = \"adxl345\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
-                "kind = \"adxl345\"\nbus = \"spidev0.0\"",
+                "kind = \"accelerometer\"\nbus = \"spidev1.0\"\nselect_pin = \"accel_cs\"",
+                "kind = \"accelerometer\"\nbus = \"spidev0.0\"",
             )
         });
         assert_eq!(chips.ask("adxl345").unwrap().text, "its id is 0xe5");
