@@ -49,6 +49,9 @@ pub enum PartConfig {
     Tmc2130(tmc5160::Tmc2130Config),
     /// A stepper driver.
     Tmc2240(tmc5160::Tmc2240Config),
+    /// A stepper driver on a UART.
+    #[serde(rename = "tmc2240_uart")]
+    Tmc2240Uart(tmc5160::Tmc2240UartConfig),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
     /// A strip of lights on an SPI bus's data output.
@@ -90,6 +93,7 @@ impl PartConfig {
             PartConfig::Tmc2208(config) => config,
             PartConfig::Tmc2130(config) => config,
             PartConfig::Tmc2240(config) => config,
+            PartConfig::Tmc2240Uart(config) => config,
             PartConfig::Tmc5160(config) => config,
             PartConfig::Ws2812(config) => config,
             PartConfig::Apa102(config) => config,

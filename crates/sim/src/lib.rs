@@ -56,7 +56,7 @@ pub use part::ssd1306::Ssd1306Config;
 pub use part::thermocouple::{Converter, SensorFault, ThermocoupleConfig};
 pub use part::tmc2209::{Tmc2208Config, Tmc2209Config, UartDriverConfig};
 pub use part::tmc2660::Tmc2660Config;
-pub use part::tmc5160::{SpiDriverConfig, Tmc2130Config, Tmc2240Config, Tmc5160Config};
+pub use part::tmc5160::{SpiDriverConfig, Tmc2130Config, Tmc2240Config, Tmc2240UartConfig, Tmc5160Config};
 pub use part::ws2812::Ws2812Config;
 pub use printer_cfg::printer_cfg;
 pub use toolpath::asked::AskedPath;

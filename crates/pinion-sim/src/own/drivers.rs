@@ -52,16 +52,23 @@ impl Translator<'_> {
             }
             None => part.set_if("select_pin", select),
         };
-        // The motor's load suits the sensitivity that its owner found.
-        if let Some(sgt) = section.whole("driver_sgt", -64)?.filter(|_| kind != "tmc2660") {
-            part = part.set("sg_free", Tmc5160Config::free_with_sgt(sgt.min(63) as i32));
-        }
-        let diags: &[&str] = if kind == "tmc2660" { &[] } else { &["diag0_pin", "diag1_pin"] };
-        for key in diags {
-            part = part.set_if(key, self.take_diag(section, key)?);
+        if kind != "tmc2660" {
+            part = self.with_stall_guard(section, part)?;
         }
         self.out.add("part", part);
         Ok(())
+    }
+
+    /// The outputs that report a stall, and the load that suits the sensitivity that the motor's owner found.
+    fn with_stall_guard(&mut self, section: &Section, part: Entry) -> Result<Entry, Trouble> {
+        let mut part = part;
+        if let Some(sgt) = section.whole("driver_sgt", -64)? {
+            part = part.set("sg_free", Tmc5160Config::free_with_sgt(sgt.min(63) as i32));
+        }
+        for key in ["diag0_pin", "diag1_pin"] {
+            part = part.set_if(key, self.take_diag(section, key)?);
+        }
+        Ok(part)
     }
 
     fn by_uart(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
@@ -69,7 +76,9 @@ impl Translator<'_> {
         section.required("uart_pin")?;
         let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
         self.take_pin(section, &pin);
-        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("uart_pin", pin.to_string());
+        // The description has another kind of a TMC2240 on SPI.
+        let part = if kind == "tmc2240" { "tmc2240_uart" } else { kind };
+        let mut part = Entry::default().set("kind", part).set("axis", axis).set("uart_pin", pin.to_string());
         let mut selects: Vec<toml::Value> = Vec::new();
         for text in section.list("select_pins", ',') {
             let select = self.pin_of(section, "select_pins", text)?;
@@ -84,8 +93,13 @@ impl Translator<'_> {
             self.take_pin(section, &tx);
             part = part.set("tx_pin", tx.to_string());
         }
-        if kind == "tmc2209" {
+        if kind != "tmc2208" {
             part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
+        }
+        if kind == "tmc2240" {
+            part = self.with_stall_guard(section, part)?;
+        }
+        if kind == "tmc2209" {
             part = part.set_if("diag_pin", self.take_diag(section, "diag_pin")?);
             if let Some(threshold) = section.whole("driver_sgthrs", 0)? {
                 part = part.set("sg_free", Tmc2209Config::free_with_sgthrs(threshold.min(255) as u32));

@@ -57,6 +57,20 @@ fn a_driver_pulls_its_stall_output_low_whatever_the_configuration_says() {
 }
 
 #[test]
+fn a_tmc2240_has_one_of_two_buses() {
+    let text = "[tmc2240 stepper_x]\nuart_pin: PG4\nuart_address: 3\nrun_current: 1\ndiag1_pin: ^!PK1\ndriver_SGT: 3\n\
+                [tmc2240 extruder]\ncs_pin: PG5\nrun_current: 1\n";
+    let Translated { description, .. } = translated(&format!("{PRINTER}{text}")).unwrap();
+    let x = named(&description, "part", "kind", "tmc2240_uart");
+    assert_eq!(
+        (x["axis"].as_str(), x["uart_pin"].as_str(), x["address"].as_integer()),
+        (Some("x"), Some("PG4"), Some(3))
+    );
+    assert_eq!((x["diag1_pin"].as_str(), x["sg_free"].as_integer()), (Some("PK1"), Some(170)));
+    assert_eq!(named(&description, "part", "kind", "tmc2240")["select_pin"].as_str(), Some("PG5"));
+}
+
+#[test]
 fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     let text = format!("{PRINTER}[beacon]\nprobe_pin: PD1\n");
     let Translated { description, notes, .. } = translated(&text).unwrap();

@@ -11,7 +11,7 @@
 //! with a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep, temperatures and faults, the automatic tuning of
 //! StealthChop, the pulse generator (VACTUAL), INDEX, and the effects of the OTP memory.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -22,13 +22,12 @@ use super::trinamic::registers::{
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
-use super::uart::{HOST, PortUart, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
+use super::uart::{UartChip, send_delay};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
-use crate::engine::wire::LevelLine;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
@@ -141,26 +140,7 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
         let chip = Tmc2209::new(&self.name(), MODEL, (self.address, self.sg_free), axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
-        let chip = Selected { chip, by: workshop.selected_by(self) };
-        if self.uart_port.is_some() {
-            workshop.solder_serial(self, PortUart(Box::new(chip)));
-            return Ok(());
-        }
-        let line = self.uart_pin.as_ref().map_or("", |pin| &pin.name);
-        if let Some((_, uart)) = workshop.uarts.iter().find(|(name, _)| name == line) {
-            uart.lock().unwrap_or_else(PoisonError::into_inner).solder(Box::new(chip));
-            return Ok(());
-        }
-        let uart = Arc::new(Mutex::new(Uart::new(Box::new(chip))));
-        workshop.uarts.push((line.to_owned(), uart.clone()));
-        let end = |role| UartPin { name: self.name(), role, uart: uart.clone() };
-        match &self.tx_pin {
-            None => workshop.wire(self.uart_pin.as_ref(), end(Role::Both)),
-            Some(tx_pin) => {
-                workshop.wire(self.uart_pin.as_ref(), end(Role::Receiver));
-                workshop.wire(Some(tx_pin), end(Role::Sender));
-            }
-        }
+        workshop.solder_uart(self, chip);
         Ok(())
     }
 
@@ -262,42 +242,21 @@ impl Tmc2209 {
     }
 }
 
-/// A chip that hears the wire while lines have their levels.
-struct Selected {
-    chip: Tmc2209,
-    by: Vec<(Arc<LevelLine>, bool)>,
-}
-
-impl UartChip for Selected {
-    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
-        let is_selected = self.by.iter().all(|(line, high)| line.is_high() == *high);
-        if is_selected { self.chip.hear(message, now) } else { None }
-    }
-
-    fn send_delay(&self) -> u64 {
-        self.chip.send_delay()
-    }
-}
-
 impl UartChip for Tmc2209 {
-    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
-        let &[_, address, register, ref rest @ ..] = message else { return None };
-        if address != self.address {
-            return None;
-        }
-        if let &[d3, d2, d1, d0, _] = rest {
-            self.write(register & !WRITE, u32::from_be_bytes([d3, d2, d1, d0]));
-            return None;
-        }
-        let [d3, d2, d1, d0] = self.read(register, now).to_be_bytes();
-        let answer = [SYNC, HOST, register, d3, d2, d1, d0];
-        let [a, b, c, d, e, f, g] = answer;
-        Some([a, b, c, d, e, f, g, crc8(&answer)])
+    fn address(&self) -> u8 {
+        self.address
+    }
+
+    fn read_register(&mut self, register: u8, now: Clock) -> u32 {
+        self.read(register, now)
+    }
+
+    fn write_register(&mut self, register: u8, data: u32) {
+        self.write(register, data);
     }
 
     fn send_delay(&self) -> u64 {
-        // 8, 24, 40 ... 120, one for each pair of values.
-        8 * u64::from(self.registers.get(SLAVECONF) >> 8 & 0xf | 1)
+        send_delay(self.registers.get(SLAVECONF))
     }
 }
 
@@ -318,6 +277,9 @@ fn stall_rule(registers: &Registers, sg_free: u32, mres: u32) -> StallRule {
 #[cfg(test)]
 mod tests {
     use super::super::trinamic::registers::{GSTAT, IHOLD_IRUN};
+    use std::sync::Mutex;
+
+    use super::super::uart::{Role, Uart, UartPin, crc8};
     use super::*;
     use crate::description::default::DefaultPrinter;
     use crate::engine::wire::Wire;

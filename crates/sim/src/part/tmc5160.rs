@@ -19,12 +19,13 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::trinamic::registers::{
-    CHOPCONF, COOLCONF, DRV_STATUS, GCONF, GSTAT, MSCNT, MSCURACT, MSLUT, MSLUTSEL, MSLUTSTART, PWM_AUTO, Registers,
-    SPI_IOIN as IOIN, TCOOLTHRS, TPWMTHRS, TSTEP,
+    CHOPCONF, COOLCONF, DRV_STATUS, GCONF, GSTAT, IFCNT, MSCNT, MSCURACT, MSLUT, MSLUTSEL, MSLUTSTART, PWM_AUTO,
+    Registers, SLAVECONF, SPI_IOIN as IOIN, TCOOLTHRS, TPWMTHRS, TSTEP,
 };
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
+use super::uart::{UartChip, send_delay};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
@@ -129,18 +130,14 @@ impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
                 return wrong(whose, "chain_position", "it needs a place within chain_length", &remedy);
             }
         }
-        if !(-1000..=1000).contains(&self.sg_free) {
-            return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give -1000 to 1000");
-        }
+        check_sg_free(whose, self.sg_free)?;
         printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(axis) = workshop.axis(&self.axis) {
             let chip = Tmc5160::new(self.name(), (MODEL, self.sg_free), axis, workshop.clock.clone());
-            let [diag0, diag1] = chip.diag.clone();
-            workshop.wire_shared(self.diag0_pin.as_ref(), diag0);
-            workshop.wire_shared(self.diag1_pin.as_ref(), diag1);
+            chip.wire_diags(workshop, [&self.diag0_pin, &self.diag1_pin]);
             workshop.solder_spi(self, chip);
         }
         Ok(())
@@ -167,6 +164,93 @@ impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
     }
 }
 
+/// A driver TMC2240 on its UART.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tmc2240UartConfig {
+    /// The wire for both directions; with `tx_pin` it is the board's receiving end.
+    pub uart_pin: PinName,
+    /// The board's sending end, joined to the wire by a resistor.
+    pub tx_pin: Option<PinName>,
+    /// The lines of a multiplexer that connect it to the wire, each at its level: `!` for low.
+    #[serde(default)]
+    pub select_pins: Vec<PinName>,
+    /// Its address, 0 to 7, by its pins.
+    #[serde(default)]
+    pub address: u8,
+    /// The axis with the motor that it drives.
+    pub axis: String,
+    /// DIAG1, an open drain with a pull-up resistor: low while the motor is stalled.
+    pub diag1_pin: Option<PinName>,
+    /// DIAG0, an open drain too, with the same meaning if the host asks for it.
+    pub diag0_pin: Option<PinName>,
+    /// SG_RESULT of a free motor with SGT at 0. Each step of SGT adds 10. A motor with full load has 300 less.
+    #[serde(default = "default_sg_free")]
+    pub sg_free: i32,
+}
+
+impl Part for Tmc2240UartConfig {
+    fn name(&self) -> String {
+        format!("tmc2240 {}", self.axis)
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("diag1_pin", self.diag1_pin.as_ref()), ("diag0_pin", self.diag0_pin.as_ref())]
+    }
+
+    fn select_pins(&self) -> &[PinName] {
+        &self.select_pins
+    }
+
+    fn uart_pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("uart_pin", Some(&self.uart_pin)), ("tx_pin", self.tx_pin.as_ref())]
+    }
+
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
+        if self.address > 7 {
+            return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 7");
+        }
+        for (key, pin) in [("uart_pin", Some(&self.uart_pin)), ("tx_pin", self.tx_pin.as_ref())] {
+            if pin.is_some_and(|pin| pin.inverted) {
+                return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
+            }
+        }
+        check_sg_free(whose, self.sg_free)?;
+        printer.check_axis(whose, &self.axis)
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
+        if let Some(axis) = workshop.axis(&self.axis) {
+            let mut chip = Tmc5160::new(self.name(), (2240, self.sg_free), axis, workshop.clock.clone());
+            chip.address = self.address;
+            chip.wire_diags(workshop, [&self.diag0_pin, &self.diag1_pin]);
+            workshop.solder_uart(self, chip);
+        }
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
+        cfg.section(format_args!("tmc2240 {}", layout.stepper(&self.axis)));
+        may_be_left_out(cfg);
+        cfg.key("uart_pin", &self.uart_pin);
+        cfg.key_if("tx_pin", self.tx_pin.as_ref());
+        if !self.select_pins.is_empty() {
+            let pins: Vec<String> = self.select_pins.iter().map(ToString::to_string).collect();
+            cfg.key("select_pins", pins.join(", "));
+        }
+        cfg.key("uart_address", self.address);
+        cfg.key("run_current", 0.8);
+        cfg.key("rref", 12000);
+    }
+}
+
+fn check_sg_free(whose: &str, sg_free: i32) -> Result<(), Trouble> {
+    match sg_free {
+        -1000..=1000 => Ok(()),
+        _ => wrong(whose, "sg_free", &format!("{sg_free} is no SG_RESULT"), "give -1000 to 1000"),
+    }
+}
+
 struct Tmc5160 {
     model: u16,
     /// SG_RESULT of the free motor with SGT at 0.
@@ -181,6 +265,9 @@ struct Tmc5160 {
     bytes: usize,
     /// The data that the next datagram returns.
     reply: u32,
+    /// Its address on the UART, and the number of messages that wrote a register.
+    address: u8,
+    written: u8,
 }
 
 impl Tmc5160 {
@@ -190,9 +277,17 @@ impl Tmc5160 {
         let diag = [0, 1]
             .map(|pin| Arc::new(StallOutput::new(name.clone(), axis.clone(), stall_rule(&registers, sg_free, pin))));
         let motor = Motor::new(axis);
-        let mut chip = Tmc5160 { model, sg_free, motor, time, diag, registers, shift: 0, bytes: 0, reply: 0 };
+        let (shift, bytes, reply, address, written) = (0, 0, 0, 0, 0);
+        let mut chip = Tmc5160 { model, sg_free, motor, time, diag, registers, shift, bytes, reply, address, written };
         chip.set_up_motor();
         chip
+    }
+
+    /// Wires DIAG0 and DIAG1.
+    fn wire_diags(&self, workshop: &mut Workshop<'_>, pins: [&Option<PinName>; 2]) {
+        for (pin, diag) in pins.into_iter().zip(&self.diag) {
+            workshop.wire_shared(pin.as_ref(), diag.clone());
+        }
     }
 
     fn set_up_motor(&mut self) {
@@ -214,6 +309,7 @@ impl Tmc5160 {
                 };
                 version | SD_MODE | off << 4 | inputs[1] << 1 | inputs[0]
             }
+            IFCNT => self.written.into(),
             TSTEP => self.motor.tstep(now),
             MSCNT => self.motor.mscnt(),
             MSCURACT => {
@@ -284,6 +380,26 @@ fn stall_rule(registers: &Registers, sg_free: i32, pin: usize) -> StallRule {
     }
 }
 
+/// A TMC2240's.
+impl UartChip for Tmc5160 {
+    fn address(&self) -> u8 {
+        self.address
+    }
+
+    fn read_register(&mut self, register: u8, _now: Clock) -> u32 {
+        self.read(register)
+    }
+
+    fn write_register(&mut self, register: u8, data: u32) {
+        self.write(register, data);
+        self.written = self.written.wrapping_add(1);
+    }
+
+    fn send_delay(&self) -> u64 {
+        send_delay(self.registers.get(SLAVECONF))
+    }
+}
+
 impl SpiChip for Tmc5160 {
     fn knows_mode(&self, mode: u8) -> bool {
         mode == MODE
@@ -326,6 +442,7 @@ impl SpiChip for Tmc5160 {
 #[cfg(test)]
 mod tests {
     use super::super::trinamic::registers::{ADC_35_C, IHOLD_IRUN, OTP, PWMCONF};
+    use super::super::uart::crc8;
     use super::*;
     use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::{CLOCK_FREQ, VirtualClock};
@@ -511,5 +628,21 @@ mod tests {
         bench.advance_ms(90);
         bench.write(GCONF, GCONF_DIAG_STALL[1]);
         assert!(!bench.chip.diag[1].is_stalled(bench.clock.now()), "it stands still");
+    }
+
+    #[test]
+    fn a_tmc2240_on_its_uart_counts_what_it_was_written() {
+        let mut bench = Bench::of(2240);
+        bench.chip.address = 3;
+        let now = bench.clock.now();
+        let mut hear = |bytes: &[u8]| {
+            let message = [bytes, &[crc8(bytes)]].concat();
+            bench.chip.hear(&message, now).map(|answer| u32::from_be_bytes(answer[3..7].try_into().unwrap()))
+        };
+        assert_eq!(hear(&[0x05, 3, IOIN]).unwrap() >> 24, 0x40);
+        assert_eq!(hear(&[0x05, 0, IOIN]), None, "another chip's address");
+        assert_eq!(hear(&[0x05, 3, IFCNT]), Some(0));
+        assert_eq!(hear(&[0x05, 3, TCOOLTHRS | WRITE, 0, 0, 1, 2]), None);
+        assert_eq!((hear(&[0x05, 3, IFCNT]), hear(&[0x05, 3, TCOOLTHRS])), (Some(1), Some(0x102)));
     }
 }

@@ -6,7 +6,7 @@
 use std::sync::{Arc, Mutex, TryLockError};
 
 use crate::engine::serial::SerialChip;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{Kind, LevelLine, Wire};
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
 /// The low nibble of a message's first byte. The high nibble may have any value.
@@ -79,11 +79,65 @@ enum Expects {
 
 /// A chip with a UART.
 pub(crate) trait UartChip: Send {
-    /// Takes a message in and returns the answer.
-    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]>;
+    fn address(&self) -> u8;
+
+    /// The value of a register.
+    fn read_register(&mut self, register: u8, now: Clock) -> u32;
+
+    fn write_register(&mut self, register: u8, data: u32);
 
     /// Bit times from a message to its answer.
     fn send_delay(&self) -> u64;
+
+    /// Takes a message in and returns the answer.
+    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
+        let &[_, address, register, ref rest @ ..] = message else { return None };
+        if address != self.address() {
+            return None;
+        }
+        if let &[d3, d2, d1, d0, _] = rest {
+            self.write_register(register & !WRITE, u32::from_be_bytes([d3, d2, d1, d0]));
+            return None;
+        }
+        let [d3, d2, d1, d0] = self.read_register(register, now).to_be_bytes();
+        let answer = [SYNC, HOST, register, d3, d2, d1, d0];
+        let [a, b, c, d, e, f, g] = answer;
+        Some([a, b, c, d, e, f, g, crc8(&answer)])
+    }
+}
+
+/// The delay that SENDDELAY of SLAVECONF (NODECONF) asks for: 8, 24, 40 ... 120, one for each pair of values.
+pub(crate) fn send_delay(slaveconf: u32) -> u64 {
+    8 * u64::from(slaveconf >> 8 & 0xf | 1)
+}
+
+/// A chip that hears the wire while lines have their levels.
+pub(crate) struct Selected<C> {
+    pub(crate) chip: C,
+    pub(crate) by: Vec<(Arc<LevelLine>, bool)>,
+}
+
+impl<C: UartChip> UartChip for Selected<C> {
+    fn address(&self) -> u8 {
+        self.chip.address()
+    }
+
+    fn read_register(&mut self, register: u8, now: Clock) -> u32 {
+        self.chip.read_register(register, now)
+    }
+
+    fn write_register(&mut self, register: u8, data: u32) {
+        self.chip.write_register(register, data);
+    }
+
+    fn send_delay(&self) -> u64 {
+        self.chip.send_delay()
+    }
+
+    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
+        let is_selected = self.by.iter().all(|(line, high)| line.is_high() == *high);
+        if is_selected { self.chip.hear(message, now) } else { None }
+    }
 }
 
 /// The UART of the chips on a wire. They hear the same. The wire is high when nothing drives it low.

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The interface between a part and the rest of the printer, and the place where the printer is assembled.
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use super::uart::Uart;
+use super::uart::{PortUart, Role, Selected, Uart, UartChip, UartPin};
 use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::{Kinematics, Printer};
@@ -227,6 +227,31 @@ impl Workshop<'_> {
         let Some(Socket::I2c { bus, address }) = part.socket() else { return };
         if let Some(bus) = self.i2c_buses.iter_mut().find(|other| other.name == bus) {
             bus.solder(part.name(), address, Box::new(chip));
+        }
+    }
+
+    /// Puts a chip on the wire of its UART: lines, or a serial port. Chips with the same `uart_pin` share the wire.
+    pub(crate) fn solder_uart(&mut self, part: &dyn Part, chip: impl UartChip + 'static) {
+        let chip = Box::new(Selected { chip, by: self.selected_by(part) });
+        if let Some(Socket::Serial { .. }) = part.socket() {
+            return self.solder_serial(part, PortUart(chip));
+        }
+        let pins = part.uart_pins();
+        let pin = |key: &str| pins.iter().find(|(known, _)| *known == key).and_then(|(_, pin)| *pin);
+        let (uart_pin, tx_pin) = (pin("uart_pin"), pin("tx_pin"));
+        let line = uart_pin.map_or("", |pin| &pin.name);
+        if let Some((_, uart)) = self.uarts.iter().find(|(name, _)| name == line) {
+            return uart.lock().unwrap_or_else(PoisonError::into_inner).solder(chip);
+        }
+        let uart = Arc::new(Mutex::new(Uart::new(chip)));
+        self.uarts.push((line.to_owned(), uart.clone()));
+        let end = |role| UartPin { name: part.name(), role, uart: uart.clone() };
+        match tx_pin {
+            None => self.wire(uart_pin, end(Role::Both)),
+            Some(_) => {
+                self.wire(uart_pin, end(Role::Receiver));
+                self.wire(tx_pin, end(Role::Sender));
+            }
         }
     }
 

@@ -168,8 +168,8 @@ const ONLY_2130: &[Register] = &[
 
 const ONLY_2240: &[Register] = &[
     Register(GSTAT, C, 5, 0x0000_0001),
-    Register(0x02, R, 8, 0),             // IFCNT: of the UART, which is not in use
-    Register(0x03, W, 12, 0),            // NODECONF
+    Register(IFCNT, R, 8, 0),            // computed
+    Register(SLAVECONF, W, 12, 0),       // NODECONF
     Register(0x0a, RW, 22, 0x0000_0020), // DRV_CONF
     Register(0x0b, RW, 8, 0),            // GLOBAL_SCALER
     Register(IHOLD_IRUN, RW, 28, 0x0407_0a03),
