@@ -4,6 +4,7 @@
 use std::fs;
 
 use pinion_printer_config::Config;
+use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
 use super::{Pace, Translated, translate};
@@ -68,6 +69,14 @@ fn a_tmc2240_has_one_of_two_buses() {
     );
     assert_eq!((x["diag1_pin"].as_str(), x["sg_free"].as_integer()), (Some("PK1"), Some(170)));
     assert_eq!(named(&description, "part", "kind", "tmc2240")["select_pin"].as_str(), Some("PG5"));
+}
+
+#[test]
+fn a_min_temp_of_absolute_zero_is_klippys_lowest() {
+    let text = PRINTER.replace("min_temp: 0\nmax_temp: 250\n", "min_temp: -273.15\nmax_temp: 250\n");
+    assert_ne!(text, PRINTER);
+    let Translated { description, .. } = translated(&text).unwrap();
+    SimConfig::parse(&toml::to_string(&description).unwrap(), "this test").unwrap();
 }
 
 #[test]

@@ -410,7 +410,8 @@ impl HeaterConfig {
             ("min_celsius", self.min_celsius),
         ] {
             check(whose, key, celsius, Bound::Any)?;
-            if celsius <= absolute_zero {
+            // klippy's lowest min_temp is absolute zero itself.
+            if celsius < absolute_zero || celsius == absolute_zero && key != "min_celsius" {
                 return wrong(whose, key, &format!("{celsius} is below absolute zero"), "use degrees Celsius");
             }
         }
