@@ -75,6 +75,8 @@ impl Translator<'_> {
             "adxl345" | "bmi160" | "icm20948" | "lis2dw" | "lis3dh" | "mpu9250" => self.accelerometer(section),
             "angle" => self.angle(section),
             "adc_scaled" => self.scaled(section),
+            "hall_filament_width_sensor" => self.hall_width(section),
+            "tsl1401cl_filament_width_sensor" => self.line_width(section),
             "mcp4018" | "mcp4451" | "pca9533" | "pca9632" | "sx1509" => self.i2c_register(section),
             "ad5206" | "dac084S085" => self.dac(section),
             _ => Ok(()),
@@ -307,6 +309,22 @@ impl Translator<'_> {
         self.fixed(section, "vssa_pin", 0.0)
     }
 
+    /// Two Hall sensors at the filament. klippy adds their readings, in steps of 1/10000, and knows two diameters.
+    fn hall_width(&mut self, section: &Section) -> Result<(), Trouble> {
+        let number = |key: &str, usual: f64| section.number(key, Limit::Any).map(|found| found.unwrap_or(usual));
+        let (mm1, mm2) = (number("cal_dia1", 1.5)?, number("cal_dia2", 2.0)?);
+        let (raw1, raw2) = (number("raw_dia1", 9500.0)?, number("raw_dia2", 10500.0)?);
+        let sum = raw1 + (width_mm(section)? - mm1) * (raw2 - raw1) / (mm2 - mm1);
+        let share = if sum.is_finite() { (sum / 2.0 / 10_000.0).clamp(0.0, 1.0) } else { 0.5 };
+        self.fixed(section, "adc1", share)?;
+        self.fixed(section, "adc2", share)
+    }
+
+    /// A row of light sensors across the filament: 5 mm are the ADC's whole range.
+    fn line_width(&mut self, section: &Section) -> Result<(), Trouble> {
+        self.fixed(section, "pin", (width_mm(section)? / 5.0).clamp(0.0, 1.0))
+    }
+
     fn accelerometer(&mut self, section: &Section) -> Result<(), Trouble> {
         let chip = section.kind();
         // klippy's default addresses.
@@ -379,6 +397,12 @@ impl Translator<'_> {
         self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
         Ok(())
     }
+}
+
+/// The diameter of the filament, which is the one that klippy expects.
+fn width_mm(section: &Section) -> Result<f64, Trouble> {
+    section.required("default_nominal_filament_diameter")?;
+    Ok(section.number("default_nominal_filament_diameter", Limit::Above(1.0))?.unwrap_or(1.75))
 }
 
 #[cfg(test)]

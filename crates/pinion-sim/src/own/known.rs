@@ -17,18 +17,8 @@ pub(crate) enum Kind {
 }
 
 /// Hardware without a simulation.
-const NOT_SIMULATED: &[&str] = &[
-    "ads131m0x",
-    "ads1x1x",
-    "belay",
-    "dockable_probe",
-    "hall_filament_width_sensor",
-    "mcp4728",
-    "palette2",
-    "replicape",
-    "trad_rack",
-    "tsl1401cl_filament_width_sensor",
-];
+const NOT_SIMULATED: &[&str] =
+    &["ads131m0x", "ads1x1x", "belay", "dockable_probe", "mcp4728", "palette2", "replicape", "trad_rack"];
 
 /// All others.
 const KNOWN: &[&str] = &[
@@ -78,6 +68,7 @@ const KNOWN: &[&str] = &[
     "gcode_button",
     "gcode_macro",
     "gcode_shell_command",
+    "hall_filament_width_sensor",
     "hx71x",
     "heated_fan",
     "heater_bed",
@@ -141,6 +132,7 @@ const KNOWN: &[&str] = &[
     "temperature_sensor",
     "thermistor",
     "tools_calibrate",
+    "tsl1401cl_filament_width_sensor",
     "tuning_tower",
     "verify_heater",
     "virtual_sdcard",

@@ -72,6 +72,17 @@ fn a_tmc2240_has_one_of_two_buses() {
 }
 
 #[test]
+fn sensors_of_the_filaments_width_see_the_usual_one() {
+    let text = "[hall_filament_width_sensor]\nadc1: PA4\nadc2: PA5\nRaw_dia1: 9000\nRaw_dia2: 11000\n\
+                default_nominal_filament_diameter: 1.75\nmeasurement_delay: 70\n[tsl1401cl_filament_width_sensor]\n\
+                pin: PA6\ndefault_nominal_filament_diameter: 1.75\nmeasurement_delay: 70\n";
+    let Translated { description, notes, .. } = translated(&format!("{PRINTER}{text}")).unwrap();
+    assert!(notes.is_empty(), "{notes:?}");
+    let share = |pin: &str| named(&description, "analog", "pin", pin)["fraction"].as_float();
+    assert_eq!([share("PA4"), share("PA5"), share("PA6")], [Some(0.5), Some(0.5), Some(0.35)]);
+}
+
+#[test]
 fn a_min_temp_of_absolute_zero_is_klippys_lowest() {
     let text = PRINTER.replace("min_temp: 0\nmax_temp: 250\n", "min_temp: -273.15\nmax_temp: 250\n");
     assert_ne!(text, PRINTER);
