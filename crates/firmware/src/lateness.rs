@@ -29,11 +29,8 @@ impl Default for Lateness {
 /// The bucket of a value in ticks. Values below 16 have a bucket each. Larger values share the eight buckets of their
 /// octave.
 fn bucket(late: u32) -> usize {
-    if late < PARTS as u32 {
-        return late as usize;
-    }
-    let octave = late.ilog2() as usize - PARTS.ilog2() as usize;
-    (octave + 1) * PARTS + (late >> octave) as usize - PARTS
+    let octave = (late | PARTS as u32).ilog2() - PARTS.ilog2();
+    octave as usize * PARTS + (late >> octave) as usize
 }
 
 /// The largest value of a bucket.

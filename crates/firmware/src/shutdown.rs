@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fmt;
+use std::ops::Deref;
 
 use crate::time::Clock;
 use crate::trouble::Trouble;
@@ -121,34 +122,49 @@ pub mod reason {
 
 /// A stop of the MCU: the reason for the wire, and the trouble for the log.
 ///
-/// Creating one allocates. That is allowed, because the MCU stops anyway.
+/// Creating one allocates. That is allowed, because the MCU stops anyway. It is a single pointer, so that a handler
+/// returns its result in registers.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shutdown {
+pub struct Shutdown(Box<Stop>);
+
+/// The parts of a [`Shutdown`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Stop {
     /// The text for the wire.
     pub reason: ShutdownReason,
-    /// The text for the log. It is boxed, because every handler's result has room for a stop.
-    pub trouble: Box<Trouble>,
+    /// The text for the log.
+    pub trouble: Trouble,
     /// The time that the stop is about: an event came too late for it.
     pub due: Option<Clock>,
+}
+
+impl Deref for Shutdown {
+    type Target = Stop;
+
+    fn deref(&self) -> &Stop {
+        &self.0
+    }
 }
 
 impl Shutdown {
     /// A stop with this reason. A text alone is its cause.
     #[cold]
     pub fn because(reason: ShutdownReason, trouble: impl Into<Trouble>) -> Shutdown {
-        Shutdown { reason, trouble: Box::new(trouble.into()), due: None }
+        Shutdown(Box::new(Stop { reason, trouble: trouble.into(), due: None }))
     }
 
     /// The same stop, with this remedy.
     #[cold]
-    pub fn remedy(self, remedy: impl Into<Box<str>>) -> Shutdown {
-        Shutdown { trouble: Box::new(self.trouble.remedy(remedy)), ..self }
+    pub fn remedy(mut self, remedy: impl Into<Box<str>>) -> Shutdown {
+        self.0.trouble.remedy = Some(remedy.into());
+        self
     }
 
     /// The same stop, for an event that came too late for its time.
     #[cold]
-    pub fn late_for(self, due: impl Into<Option<Clock>>) -> Shutdown {
-        Shutdown { due: due.into(), ..self }
+    pub fn late_for(mut self, due: impl Into<Option<Clock>>) -> Shutdown {
+        self.0.due = due.into();
+        self
     }
 
     /// A stop for a command that no correct host would send at that point.
@@ -161,7 +177,14 @@ impl Shutdown {
     /// The same stop, with this object as its subject.
     #[cold]
     pub fn of(self, object: &str) -> Shutdown {
-        Shutdown { trouble: Box::new(self.trouble.of(object)), ..self }
+        let Stop { reason, trouble, due } = *self.0;
+        Shutdown(Box::new(Stop { reason, trouble: trouble.of(object), due }))
+    }
+
+    /// The text for the log.
+    #[cold]
+    pub fn into_trouble(self) -> Trouble {
+        self.0.trouble
     }
 }
 

@@ -253,8 +253,8 @@ impl Line for HeldLine {
         if self.sleeping.is_some() {
             return self.write_checked(flags, level);
         }
-        let written = self.handle.set_value(level.into());
-        written.map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error)))
+        let written = sys::set_line(&self.handle, level);
+        written.map_err(|error| self.lost(reason::LINE_WRITE, "written", code_of(error)))
     }
 
     fn read(&self) -> Result<bool, Shutdown> {

@@ -236,7 +236,7 @@ impl<N: SpiNode> Spi<N> {
 
     /// Drives the chip select line, if there is one.
     fn drive(&self, how: impl FnOnce(&ChipSelect) -> Result<(), Shutdown>) -> Result<(), Trouble> {
-        self.chip_select.as_ref().map_or(Ok(()), how).map_err(|failure| *failure.trouble)
+        self.chip_select.as_ref().map_or(Ok(()), how).map_err(Shutdown::into_trouble)
     }
 
     fn converse(&mut self, bytes: Bytes<'_>) -> Result<(), BusError> {

@@ -341,7 +341,7 @@ pub trait BusDevice: Send {
 /// For a failure of a GPIO line of the bus.
 impl From<Shutdown> for BusError {
     fn from(failure: Shutdown) -> BusError {
-        BusError { status: BusStatus::Nack, trouble: *failure.trouble }
+        BusError { status: BusStatus::Nack, trouble: failure.into_trouble() }
     }
 }
 

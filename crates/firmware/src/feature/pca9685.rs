@@ -210,7 +210,7 @@ impl Chips {
     fn open(&mut self, context: &mut Context, address: Address) -> Result<(), Shutdown> {
         let config = I2cConfig { bus: address.bus.into(), address: address.address & 0x7f, rate_hz: RATE_HZ };
         let opened = context.board()?.i2c(config);
-        let OnWorker { bus, device } = opened.map_err(|error| Shutdown { reason: NOT_SET_UP, ..error })?;
+        let OnWorker { bus, device } = opened.map_err(|error| Shutdown::because(NOT_SET_UP, error.into_trouble()))?;
         let clock = context.clock();
         let calls = self.calls.get_or_insert_with(|| Calls::new(clock.clone())).clone();
         let chip = Pca { device, calls, clock, prescale: prescale(address.cycle), is_set_up: false };

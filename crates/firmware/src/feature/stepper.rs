@@ -116,8 +116,8 @@ struct Stepper {
     dir: PromptLine,
     /// The step pin's idle level.
     idle_step: bool,
-    /// Every edge is a step. Otherwise an edge back follows each step.
-    both_edges: bool,
+    /// How many edges back follow a step: one, or none if each edge is a step.
+    edges_back: u32,
     /// The shortest time between two edges. Zero if it is shorter than a [`CALL`] that makes an edge.
     pulse_ticks: Ticks,
     late_limit: Ticks,
@@ -168,7 +168,7 @@ impl Stepper {
         let interval = self.intervals.next();
         self.position = if reverses { self.position.wrapping_neg() } else { self.position };
         self.position = self.position.wrapping_add(u32::from(count));
-        self.edges = u32::from(count) << u32::from(!self.both_edges);
+        self.edges = u32::from(count) << self.edges_back;
         let Some(earliest) = earliest else {
             // After a long pause the interval has wrapped, but the step's 32-bit clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
@@ -192,7 +192,7 @@ impl Stepper {
                 .late_for(self.next_step));
         }
         if reverses {
-            if self.both_edges {
+            if self.edges_back == 0 {
                 // The last step's pulse must end before the direction changes.
                 self.reverse_pending = true;
                 return Ok(self.edge_at(context, self.next_step.min(earliest), earliest));
@@ -213,14 +213,11 @@ impl Stepper {
     #[inline]
     fn edge_at(&mut self, context: &mut Context, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
-        let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
-        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(context);
+        let in_order = self.stopper.is_some_and(|trsync| {
+            let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
+            IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && Trsync::may_stop(context, trsync)
+        });
         Next::At(if in_order { due } else { due.max(earliest) })
-    }
-
-    /// Whether a trsync waits for a trigger that stops this stepper.
-    fn may_be_stopped(&self, context: &mut Context) -> bool {
-        self.stopper.is_some_and(|trsync| Trsync::may_stop(context, trsync))
     }
 
     /// Moves on to the next step, `interval` later on a 32-bit clock. A time that is 2^31 ticks or more after
@@ -241,7 +238,7 @@ impl Stepper {
 
     /// The position that the host knows: after the steps made so far.
     fn position(&self) -> u32 {
-        let to_come = self.edges >> u32::from(!self.both_edges);
+        let to_come = self.edges >> self.edges_back;
         let position = self.position.wrapping_sub(to_come);
         if position & 0x8000_0000 != 0 { position.wrapping_neg() } else { position }
     }
@@ -262,7 +259,7 @@ impl Stepper {
     /// Sets the lines to the levels of an idle motor.
     fn idle(&mut self) -> Result<(), Shutdown> {
         let dir = self.dir.write(false);
-        if !self.both_edges {
+        if self.edges_back > 0 {
             self.step.write(self.idle_step)?;
         }
         dir
@@ -310,21 +307,19 @@ impl Object for Stepper {
                 context.made_edge();
             }
         }
+        if self.edges <= 1 {
+            // How late the next step is must be known well.
+            let earliest = context.now() + self.pulse_ticks;
+            return self.load(context, Some(earliest));
+        }
+        self.edges -= 1;
         let earliest = context.last_read() + self.pulse_ticks;
-        let edges = self.edges.saturating_sub(1);
-        if edges & 1 != 0 && !self.both_edges {
-            self.edges = edges;
+        if self.edges & self.edges_back != 0 {
             return Ok(self.edge_at(context, (self.next_step + self.pulse_ticks).min(earliest), earliest));
         }
-        if edges > 0 {
-            self.edges = edges;
-            let interval = self.intervals.next();
-            self.advance(interval, earliest);
-            return Ok(self.edge_at(context, self.next_step, earliest));
-        }
-        // How late the next step is must be known well.
-        let earliest = context.now() + self.pulse_ticks;
-        self.load(context, Some(earliest))
+        let interval = self.intervals.next();
+        self.advance(interval, earliest);
+        Ok(self.edge_at(context, self.next_step, earliest))
     }
 
     fn join(&mut self, batch: &mut Batch) -> bool {
@@ -361,7 +356,7 @@ const CONFIG_STEPPER: Command = command!(
             step,
             dir,
             idle_step,
-            both_edges,
+            edges_back: u32::from(!both_edges),
             pulse_ticks,
             late_limit: context.step_late_limit(),
             queue: MoveQueue::default(),

@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::any::Any;
+use std::mem;
 
 use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
@@ -145,9 +146,9 @@ impl Objects {
 
     #[inline]
     pub(super) fn put_back(&mut self, oid: Oid, object: Box<dyn Object>) {
-        // The place is empty, so nothing has to be dropped.
-        if let Some(slot @ None) = self.table.get_mut(oid.index()) {
-            *slot = Some(object);
+        if let Some(slot) = self.table.get_mut(oid.index()) {
+            // The place is empty, so nothing has to be dropped.
+            mem::forget(slot.replace(object));
         }
     }
 

@@ -146,8 +146,8 @@ impl Scheduler {
 
     /// Starts a timer. It is too close if it is the first of all timers and its time has passed.
     pub(super) fn schedule(&mut self, timer: TimerId, at: Clock, is_stopped: bool) -> Result<(), Shutdown> {
-        // In Klipper's C, the running timer is still the first of the queue.
-        let first = self.timing.due.get().or(self.timers.next());
+        // As in Klipper's C, a running timer is still the first of the queue.
+        let first = self.timers.next();
         self.timers.insert(at, timer);
         if first.is_none_or(|first| at < first) && !is_stopped {
             let late = self.now().since(at);
@@ -202,12 +202,13 @@ impl Scheduler {
         self.timing.step_late_limit
     }
 
-    /// Takes the next timer, which is this one, and records how late it is.
+    /// Begins to run the next timer, which is this one, and records how late it is.
     #[inline(always)]
-    fn take(&mut self, at: Clock, timer: TimerId) {
-        self.timers.pop();
+    fn begin(&mut self, at: Clock, timer: TimerId) {
+        self.timers.run();
         if timer.is_exact() {
-            let late = Ticks::between(at, self.last_read);
+            // It is due, so the difference is not negative.
+            let late = Ticks((self.last_read.since(at) as u64).min(u32::MAX.into()) as u32);
             self.lateness.record(late);
             if late > self.latest.late {
                 self.latest = Latest { late, oid: timer.oid().number() };
@@ -289,7 +290,7 @@ impl Mcu {
     /// Runs the next timer, which is this one.
     #[inline(always)]
     pub(super) fn run_timer(&mut self, at: Clock, timer: TimerId) {
-        self.state.scheduler.take(at, timer);
+        self.state.scheduler.begin(at, timer);
         let oid = timer.oid();
         let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };
         self.state.scheduler.timing.due.set(Some(at));
@@ -297,12 +298,14 @@ impl Mcu {
         self.state.scheduler.timing.due.set(None);
         match result {
             Ok(next) => {
-                if let Next::At(at) = next {
-                    self.state.scheduler.timers.insert(at, timer);
+                match next {
+                    Next::At(at) => self.state.scheduler.timers.repeat(at, timer),
+                    Next::Done => self.state.scheduler.timers.pop(),
                 }
                 self.state.objects.put_back(oid, object);
             }
             Err(stop) => {
+                self.state.scheduler.timers.pop();
                 let stop = self.state.blame(stop, object.kind(), oid);
                 self.state.objects.put_back(oid, object);
                 self.shut_down(stop);
@@ -320,6 +323,7 @@ impl Mcu {
             // The timer of an object that is gone.
             _ => {}
         }
+        self.state.scheduler.timers.pop();
         self.state.scheduler.timing.due.set(None);
     }
 

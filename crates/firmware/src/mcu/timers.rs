@@ -78,12 +78,14 @@ impl TimerId {
 pub(super) struct Timers {
     /// The next timer is at the end, so taking it moves nothing.
     waiting: Vec<(Clock, TimerId)>,
+    /// The next timer runs. It keeps its place, because it mostly gets the same one again.
+    is_running: bool,
 }
 
 impl Timers {
     /// A queue for `capacity` timers without allocation.
     pub(super) fn with_capacity(capacity: usize) -> Timers {
-        Timers { waiting: Vec::with_capacity(capacity) }
+        Timers { waiting: Vec::with_capacity(capacity), is_running: false }
     }
 
     pub(super) fn reserve(&mut self, capacity: usize) {
@@ -119,35 +121,68 @@ impl Timers {
         self.waiting.last().copied()
     }
 
+    /// The next timer runs now, until [`Timers::pop`] or [`Timers::repeat`].
+    #[inline]
+    pub(super) fn run(&mut self) {
+        self.is_running = true;
+    }
+
     /// Takes the next timer.
     #[inline]
     pub(super) fn pop(&mut self) {
+        self.is_running = false;
         self.waiting.pop();
+    }
+
+    /// The running timer, which is this one, runs again at this time, after those with the same due time.
+    #[inline]
+    pub(super) fn repeat(&mut self, at: Clock, timer: TimerId) {
+        self.is_running = false;
+        self.settle(at, timer);
     }
 
     /// Inserts a timer after those with the same due time. A timer is in the queue at most once. So there are never
     /// more entries than the objects have timers.
-    #[inline]
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
-        debug_assert!(!self.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
-        let mut place = self.waiting.len();
-        self.waiting.push((at, timer));
+        self.change(|timers| {
+            debug_assert!(!timers.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
+            timers.waiting.push((at, timer));
+            timers.settle(at, timer);
+        });
+    }
+
+    /// Puts a timer into its place. The last entry of the queue is free for that.
+    #[inline]
+    fn settle(&mut self, at: Clock, timer: TimerId) {
+        let mut waiting = self.waiting.as_mut_slice();
         // Its place is usually near the end, so moving entries one by one is faster than memmove.
-        while let Some([before, own]) = self.waiting.get_mut(place.wrapping_sub(1)..=place)
+        while let [earlier @ .., free] = waiting
+            && let Some(before) = earlier.last()
             && before.0 <= at
         {
-            mem::swap(before, own);
-            place -= 1;
+            *free = *before;
+            waiting = earlier;
+        }
+        if let [.., free] = waiting {
+            *free = (at, timer);
         }
     }
 
     pub(super) fn remove(&mut self, timer: TimerId) {
-        self.waiting.retain(|(_, waiting)| *waiting != timer);
+        self.change(|timers| timers.waiting.retain(|(_, waiting)| *waiting != timer));
     }
 
     /// Removes the timers of objects.
     pub(super) fn clear(&mut self) {
-        self.waiting.retain(|(_, timer)| timer.oid == Oid::NONE);
+        self.change(|timers| timers.waiting.retain(|(_, timer)| timer.oid == Oid::NONE));
+    }
+
+    /// Changes the waiting timers, without the running one.
+    fn change(&mut self, change: impl FnOnce(&mut Timers)) {
+        let running = if mem::take(&mut self.is_running) { self.waiting.pop() } else { None };
+        change(self);
+        self.waiting.extend(running);
+        self.is_running = running.is_some();
     }
 }
 
@@ -171,6 +206,34 @@ mod tests {
             expected.sort_by_key(|(at, _)| *at);
             let got: Vec<_> = std::iter::from_fn(|| timers.first().inspect(|_| timers.pop())).collect();
             prop_assert_eq!(got, expected);
+        }
+
+        /// Each step runs the next timer. Its event starts a timer, removes one (perhaps itself), and it may run again.
+        #[test]
+        fn a_timer_that_runs_is_as_if_it_was_taken(
+            steps in proptest::collection::vec((0u64..20, 0u8..40, proptest::option::of(0u64..20)), 0..40),
+        ) {
+            let (mut timers, mut taken) = (Timers::with_capacity(0), Timers::with_capacity(0));
+            for queue in [&mut timers, &mut taken] {
+                queue.insert(Clock::from_ticks(10), TimerId::of(Oid::new(255), Timer::exact(0)));
+            }
+            for (number, (starts, removes, again)) in (0..).zip(steps) {
+                let Some((_, timer)) = timers.first() else { break };
+                timers.run();
+                taken.pop();
+                for queue in [&mut timers, &mut taken] {
+                    queue.insert(Clock::from_ticks(starts), TimerId::of(Oid::new(number), Timer::exact(0)));
+                    queue.remove(TimerId::of(Oid::new(removes), Timer::exact(0)));
+                }
+                match again.map(Clock::from_ticks) {
+                    Some(at) => {
+                        timers.repeat(at, timer);
+                        taken.insert(at, timer);
+                    }
+                    None => timers.pop(),
+                }
+                prop_assert_eq!(&timers.waiting, &taken.waiting);
+            }
         }
     }
 }

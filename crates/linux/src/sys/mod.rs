@@ -267,7 +267,12 @@ mod request {
     nix::ioctl_readwrite!(gpio_v2_line_set_config, 0xB4, 0x0d, super::LineRequestConfig);
     nix::ioctl_readwrite!(gpio_v2_line_get_values, 0xB4, 0x0e, super::LineRequestValues);
     nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
-    nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
+    // The kernel only reads the values.
+    nix::ioctl_write_ptr_bad!(
+        gpiohandle_set_line_values,
+        nix::request_code_readwrite!(0xB4, 0x09, size_of::<super::LineValues>()),
+        super::LineValues
+    );
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
     nix::ioctl_none_bad!(tiocexcl, libc::TIOCEXCL);
     nix::ioctl_none_bad!(tiocnxcl, libc::TIOCNXCL);
@@ -371,10 +376,10 @@ pub fn line_faults(port: &impl AsFd) -> io::Result<LineFaults> {
 
 /// Drives the only line of a handle of the GPIO character device.
 pub fn set_line(line: &impl AsRawFd, value: bool) -> io::Result<()> {
-    let mut values = LineValues([0; 64]);
-    values.0[0] = value.into();
-    // SAFETY: the request takes a `struct gpiohandle_data`, which lives through the call.
-    unsafe { request::gpiohandle_set_line_values(line.as_raw_fd(), &mut values) }?;
+    static LOW: LineValues = LineValues([0; 64]);
+    static HIGH: LineValues = LineValues([1; 64]);
+    // SAFETY: the request reads a `struct gpiohandle_data`.
+    unsafe { request::gpiohandle_set_line_values(line.as_raw_fd(), if value { &HIGH } else { &LOW }) }?;
     Ok(())
 }
 

@@ -20,7 +20,7 @@ pub(super) struct FakeSerial {
 
 impl SerialPort for FakeSerial {
     fn send(&mut self, bytes: &[u8]) -> Result<(), Trouble> {
-        self.bench.broken(self.pin, reason::SERIAL_OPEN).map_err(|stop| *stop.trouble)?;
+        self.bench.broken(self.pin, reason::SERIAL_OPEN).map_err(Shutdown::into_trouble)?;
         self.bench.pass(Ticks(CLOCK_FREQ / self.rate_hz * 10 * bytes.len() as u32));
         // The state is not locked while the other end answers, because it may read the bench.
         let end = self.bench.state().serial_ends.remove(&self.pin);
