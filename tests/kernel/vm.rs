@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::emulator::{Emulator, SILENCE_MAX};
+use super::emulator::Emulator;
 use super::guest_program::OtherProgram;
 use super::report::{Outcome, Report};
 use super::snapshot::Snapshot;
@@ -21,6 +21,11 @@ use pinion_testkit::kernel::{Flavour, Kernel};
 pub const EMULATOR: &str = "qemu-system-x86_64";
 
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Longest silence, in processor time of the emulator: 10 s for each second of the guest after which init.sh ends a test.
+const SILENCE_MAX: Duration = Duration::from_secs(1200);
+/// Longest silence by the computer's clock, for an emulator that uses no processor time.
+const STALL_MAX: Duration = Duration::from_secs(3600);
 
 /// QEMU's exit code from init after all tests of the plan.
 const EXIT_PLAN_DONE: i32 = 33;
@@ -143,10 +148,11 @@ fn keep_profiles(share: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Waits until the VM has ended. Returns how it ended, for the tests without a result.
+/// Waits until the VM has ended. Returns how it ended, for the tests without a result. The silence is processor time of
+/// the emulator: a busy computer stops it, and the guest.
 fn follow(emulator: &mut Emulator) -> Result<String, String> {
     let mut said = 0;
-    let mut heard = Instant::now();
+    let mut heard = (Instant::now(), emulator.processor_time()?);
     loop {
         if let Some(status) = emulator.ended()? {
             return Ok(match status.code() {
@@ -157,10 +163,16 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
         // The console shows each test's name when it starts.
         let length = emulator.console().len();
         if length != said {
-            (said, heard) = (length, Instant::now());
+            (said, heard) = (length, (Instant::now(), emulator.processor_time()?));
         }
-        if heard.elapsed() > SILENCE_MAX {
-            return Ok(format!("no result for {} s: stopped", SILENCE_MAX.as_secs()));
+        let (since, spent) = heard;
+        let silence = emulator.processor_time()?.saturating_sub(spent);
+        if silence > SILENCE_MAX || since.elapsed() > STALL_MAX {
+            return Ok(format!(
+                "no result for {} s, with {} s of processor time: stopped",
+                since.elapsed().as_secs(),
+                silence.as_secs()
+            ));
         }
         thread::sleep(POLL_INTERVAL);
     }
