@@ -92,7 +92,8 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
     let mut filtered_out = 0;
     for flavour in Flavour::ALL {
         let mut add = |program, tests: &[String], in_a_vm: usize| {
-            let whole = Run { flavour, program, tests: tests.to_vec() };
+            let print_seconds = options.print_seconds;
+            let whole = Run { flavour, program, print_seconds, tests: tests.to_vec() };
             let (selected, left_out): (Vec<_>, Vec<_>) =
                 tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
             filtered_out += left_out.len();
@@ -100,7 +101,7 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
             // In turn: the tests of one file take about the same time, and may be the longest.
             runs.extend((0..vms).map(|vm| {
                 let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
-                Run { flavour, program, tests }
+                Run { flavour, program, print_seconds, tests }
             }));
         };
         add(None, &others, TESTS_IN_A_VM);

@@ -20,11 +20,14 @@ use pinion_testkit::kernel::{Flavour, Kernel};
 
 pub const EMULATOR: &str = "qemu-system-x86_64";
 
+/// init.sh ends a test after this time of the guest, and a print's time.
+const TEST_S: u32 = 90;
+
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Longest silence, in processor time of the emulator: 10 s for each second of the guest after which init.sh ends a test.
-const SILENCE_MAX: Duration = Duration::from_secs(1200);
-/// Longest silence by the computer's clock, for an emulator that uses no processor time.
+/// Longest processor time of the emulator for a second of a busy guest.
+const SECOND: Duration = Duration::from_secs(10);
+/// Longest silence by the computer's clock, beyond that time, for an emulator that uses no processor time.
 const STALL_MAX: Duration = Duration::from_secs(3600);
 
 /// QEMU's exit code from init after all tests of the plan.
@@ -52,6 +55,7 @@ pub struct Run<'a> {
     pub flavour: Flavour,
     /// The measured program, if it is not Pinion.
     pub program: Option<&'a OtherProgram>,
+    pub print_seconds: u32,
     pub tests: Vec<String>,
 }
 
@@ -77,7 +81,7 @@ impl Run<'_> {
         let folder = folder.path();
         let plan = folder.join("plan");
         let program = self.program.map(OtherProgram::command).unwrap_or_default();
-        let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
+        let text: String = self.tests.iter().map(|test| format!("{test} {} {program}\n", self.print_seconds)).collect();
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
         let mut vm = vm(folder)?;
         vm.args(TIME)
@@ -88,7 +92,7 @@ impl Run<'_> {
         emulator.wait_until(|status| status != "inmigrate")?;
         emulator.ask(json!({"execute": "cont"}))?;
 
-        let cause = follow(&mut emulator)?;
+        let cause = follow(&mut emulator, SECOND * (TEST_S + self.print_seconds))?;
         let share = folder.join("share");
         let count = self.report_results(&share, report)?;
         keep_profiles(&share)?;
@@ -150,7 +154,7 @@ fn keep_profiles(share: &Path) -> Result<(), String> {
 
 /// Waits until the VM has ended. Returns how it ended, for the tests without a result. The silence is processor time of
 /// the emulator: a busy computer stops it, and the guest.
-fn follow(emulator: &mut Emulator) -> Result<String, String> {
+fn follow(emulator: &mut Emulator, silence_max: Duration) -> Result<String, String> {
     let mut said = 0;
     let mut heard = (Instant::now(), emulator.processor_time()?);
     loop {
@@ -167,7 +171,7 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
         }
         let (since, spent) = heard;
         let silence = emulator.processor_time()?.saturating_sub(spent);
-        if silence > SILENCE_MAX || since.elapsed() > STALL_MAX {
+        if silence > silence_max || since.elapsed() > STALL_MAX + silence_max {
             return Ok(format!(
                 "no result for {} s, with {} s of processor time: stopped",
                 since.elapsed().as_secs(),
