@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The command line.
 
+use super::cache_lines;
 use super::guest_program::OtherProgram;
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::kernel::Flavour;
@@ -35,8 +36,8 @@ pub struct Options {
     pub shell: bool,
 }
 
-/// Figures that take minutes: a search for a rate, prints. They run only if a filter asks for them, such as `figures`.
-const LONG: [&str; 2] = ["figures::most_steps", "figures::print"];
+/// Figures that take long: a search for a rate, prints, a count of cache lines. They run only if a filter asks for them, such as `figures`.
+const LONG: [&str; 3] = ["figures::most_steps", "figures::print", cache_lines::TESTS];
 
 impl Options {
     /// Exits after an error, and for `--help`.

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
+use super::cache_lines::CacheLines;
 use super::emulator::Emulator;
 use super::guest_program::OtherProgram;
 use super::report::{Outcome, Report};
@@ -88,13 +89,17 @@ impl Run<'_> {
             // The file that `-kernel` put into the VM that was booted.
             .args(["-option-rom", "pvh.bin", "-incoming", &snapshot.source(), "-fw_cfg"])
             .arg(format!("name=opt/pinion/plan,file={}", plan.display()));
+        let lines = CacheLines::of(&self.tests, folder)?;
+        if let Some(lines) = &lines {
+            vm.arg("-plugin").arg(lines.option());
+        }
         let mut emulator = Emulator::start(vm, folder)?;
         emulator.wait_until(|status| status != "inmigrate")?;
         emulator.ask(json!({"execute": "cont"}))?;
 
         let cause = follow(&mut emulator, SECOND * (TEST_S + self.print_seconds))?;
         let share = folder.join("share");
-        let count = self.report_results(&share, report)?;
+        let count = self.report_results(&share, lines.as_ref(), report)?;
         keep_profiles(&share)?;
         if count < self.tests.len() {
             let console = emulator.console();
@@ -113,7 +118,12 @@ impl Run<'_> {
     }
 
     /// Reports the guest's results from the folder, and returns their number.
-    fn report_results(&self, share: &Path, report: &Mutex<&mut Report>) -> Result<usize, String> {
+    fn report_results(
+        &self,
+        share: &Path,
+        lines: Option<&CacheLines>,
+        report: &Mutex<&mut Report>,
+    ) -> Result<usize, String> {
         let results = fs::read_to_string(share.join("results")).unwrap_or_default();
         let mut reported = 0;
         // A line without an end was still being written.
@@ -123,9 +133,18 @@ impl Run<'_> {
                 return Err(format!("the guest reported {line:?}, which was not its next test"));
             }
             let output = fs::read(share.join("output").join(test)).unwrap_or_default();
-            let output = String::from_utf8_lossy(&output);
+            let mut output = String::from_utf8_lossy(&output).into_owned();
             // libtest reports success for a name that the program does not know.
-            let passed = status == "0" && output.contains("test result: ok. 1 passed;");
+            let mut passed = status == "0" && output.contains("test result: ok. 1 passed;");
+            if let Some(lines) = lines {
+                match lines.figures() {
+                    Ok(figures) => output += &figures,
+                    Err(cause) => {
+                        output += &cause;
+                        passed = false;
+                    }
+                }
+            }
             let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
             report.lock().expect("no VM panics").test(self, test, outcome, &output);
             reported += 1;

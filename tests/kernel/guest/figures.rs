@@ -388,6 +388,13 @@ fn most_steps_with_registers() {
     }
 }
 
+/// The computer's side counts: see `tests/kernel/cache_lines.rs`. The processor is idle before each edge.
+#[test]
+fn cache_lines() {
+    let load = Load::steady(1, 40, 1, false);
+    Session::start(Way::Kernel).run(&load, |_| ()).expect("steps");
+}
+
 fn instructions_an_edge(session: &mut Session, load: &Load, _: &str) -> Result<String, String> {
     let mut looks = Vec::new();
     let start = session.run(load, |program| looks.push((Instant::now(), program.cpu_time())))?;
