@@ -36,8 +36,9 @@ pub struct Options {
     pub shell: bool,
 }
 
-/// Figures that take long: a search for a rate, prints, a count of cache lines. They run only if a filter asks for them, such as `figures`.
-const LONG: [&str; 3] = ["figures::most_steps", "figures::print", cache_lines::TESTS];
+/// Figures that take long: a search for a rate, prints, messages of a UART, a count of cache lines. They run only if a
+/// filter asks for them, such as `figures`.
+const LONG: [&str; 4] = ["figures::most_steps", "figures::print", "figures::uart", cache_lines::TESTS];
 
 impl Options {
     /// Exits after an error, and for `--help`.

@@ -5,6 +5,7 @@
 //! Only Pinion's figures are asserted.
 
 mod print;
+mod uart;
 
 use std::collections::BTreeMap;
 use std::fs;
