@@ -12,9 +12,8 @@ use serde_json::{Value, json};
 
 use pinion_testkit::process;
 
-/// Longest silence: more than a boot, or a test, takes on a computer that leaves the emulator a tenth of a processor.
-/// init.sh ends a test that hangs, by the guest's time.
-pub const SILENCE_MAX: Duration = Duration::from_secs(600);
+/// Longest wait for a state: more than a boot takes on a computer that leaves the emulator a tenth of a processor.
+const WAIT_MAX: Duration = Duration::from_secs(600);
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
 
 /// It ends when this is dropped.
@@ -84,7 +83,7 @@ impl Emulator {
             if reached(status) {
                 return Ok(());
             }
-            if started.elapsed() > SILENCE_MAX {
+            if started.elapsed() > WAIT_MAX {
                 return Err(format!("the VM is {status} for too long\n{}", self.said()));
             }
             thread::sleep(POLL_INTERVAL);
@@ -94,6 +93,11 @@ impl Emulator {
     /// Its status; `None` if it has not ended.
     pub fn ended(&mut self) -> Result<Option<ExitStatus>, String> {
         self.qemu.try_wait().map_err(|error| error.to_string())
+    }
+
+    /// Its processor time so far.
+    pub fn processor_time(&self) -> Result<Duration, String> {
+        process::processor_time(&self.qemu)
     }
 
     /// The VM's console output.

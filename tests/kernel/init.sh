@@ -3,9 +3,9 @@
 # The guest's first process. With GUEST_SHELL on the kernel's command line it starts a shell instead of the tests.
 #
 # The tests of the plan run one by one, each in its own process. So a test that dies does not end the others. A line of
-# the plan may have a command after the test: the program to measure instead of pinion. Results go to the 9p share:
-# lines "NAME STATUS" in results, and each test's output in output/NAME. Each test's name goes to the console when it
-# starts.
+# the plan has a test, the seconds of a print to measure, and maybe a command: the program to measure instead of pinion.
+# Results go to the 9p share: lines "NAME STATUS" in results, and each test's output in output/NAME. Each test's name goes
+# to the console when it starts.
 . /tests/start.sh
 
 while read -r module options; do
@@ -39,9 +39,10 @@ kernel_log() {
 export LLVM_PROFILE_FILE=/tmp/tests/output/%m%c.profraw
 
 run_test() {
-	MEASURED_PROGRAM=$2 timeout -s KILL 120 guest --exact "$1" --nocapture </dev/null
+	limit=$((90 + $2))
+	PRINT_SECONDS=$2 MEASURED_PROGRAM=$3 timeout -s KILL $limit guest --exact "$1" --nocapture </dev/null
 	status=$?
-	[ $status = 137 ] && echo "killed: it took longer than 120 s"
+	[ $status = 137 ] && echo "killed: it took longer than $limit s"
 	kernel_log || status=99
 	return $status
 }
@@ -67,9 +68,9 @@ insmod /tests/plan.ko
 cat /sys/firmware/qemu_fw_cfg/by_name/opt/pinion/plan/raw >/tmp/plan
 mkdir -p /tmp/tests/output
 dmesg -c >/tmp/tests/output/boot
-while read -r test program; do
+while read -r test print_seconds program; do
 	echo "test: $test"
-	run_test "$test" "$program" >"/tmp/tests/output/$test" 2>&1
+	run_test "$test" "$print_seconds" "$program" >"/tmp/tests/output/$test" 2>&1
 	echo "$test $?" >>/tmp/tests/results
 done </tmp/plan
 # Do not use the computer before the tests are over: the time of its answers is never the same twice.

@@ -5,6 +5,7 @@
 //! This is the computer's side, a separate test harness. It builds the VMs' boot files and lists the tests of the guest
 //! binary. It distributes each flavor's tests to a few VMs, and prints each test by name as libtest does.
 
+mod cache_lines;
 mod emulator;
 mod guest_program;
 mod klippy;
@@ -88,11 +89,14 @@ fn run(options: &Options) -> Result<bool, String> {
 /// The VMs' runs, and the number of tests that were not selected.
 fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
     let (figures, others): (Vec<_>, Vec<_>) = tests.into_iter().partition(|test| test.starts_with(FIGURES));
+    let (counted, figures): (Vec<_>, Vec<_>) =
+        figures.into_iter().partition(|test| test.starts_with(cache_lines::TESTS));
     let mut runs = Vec::new();
     let mut filtered_out = 0;
     for flavour in Flavour::ALL {
         let mut add = |program, tests: &[String], in_a_vm: usize| {
-            let whole = Run { flavour, program, tests: tests.to_vec() };
+            let print_seconds = options.print_seconds;
+            let whole = Run { flavour, program, print_seconds, tests: tests.to_vec() };
             let (selected, left_out): (Vec<_>, Vec<_>) =
                 tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
             filtered_out += left_out.len();
@@ -100,12 +104,13 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
             // In turn: the tests of one file take about the same time, and may be the longest.
             runs.extend((0..vms).map(|vm| {
                 let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
-                Run { flavour, program, tests }
+                Run { flavour, program, print_seconds, tests }
             }));
         };
         add(None, &others, TESTS_IN_A_VM);
         for program in [None].into_iter().chain(options.programs.iter().map(Some)) {
             add(program, &figures, figures.len());
+            add(program, &counted, 1);
         }
     }
     (runs, filtered_out)

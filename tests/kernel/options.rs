@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The command line.
 
+use super::cache_lines;
 use super::guest_program::OtherProgram;
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::kernel::Flavour;
@@ -20,6 +21,7 @@ Options:
   --program 'NAME=PATH [ARGUMENTS]'
                      Have the tests of figures measure this program of the
                      host, too: one that takes the options of Klipper's linux MCU
+  --print-seconds N  Measure N seconds of each print with klippy, not 30
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
 /// The selected tests and the way to run them.
@@ -27,29 +29,35 @@ pub struct Options {
     arguments: Arguments,
     pub flavour: Option<Flavour>,
     pub programs: Vec<OtherProgram>,
+    /// Length of the measured part of a print.
+    pub print_seconds: u32,
     pub list: bool,
     pub show_output: bool,
     pub shell: bool,
 }
 
-/// Figures that take minutes: a search for a rate, prints. They run only if a filter asks for them, such as `figures`.
-const LONG: [&str; 2] = ["figures::most_steps", "figures::print"];
+/// Figures that take long: a search for a rate, prints, messages of a UART, a count of cache lines. They run only if a
+/// filter asks for them, such as `figures`.
+const LONG: [&str; 4] = ["figures::most_steps", "figures::print", "figures::uart", cache_lines::TESTS];
 
 impl Options {
     /// Exits after an error, and for `--help`.
     pub fn from_args() -> Options {
-        let (mut flavour, mut programs, mut list, mut shell) = (None, Vec::new(), false, false);
+        let (mut flavour, mut programs, mut print_seconds, mut list, mut shell) = (None, Vec::new(), 30, false, false);
         let arguments = Arguments::read(USAGE, |option, value| {
             match option {
                 "--list" => list = true,
                 "--flavour" => flavour = Some(value()?.parse()?),
                 "--program" => programs.push(value()?.parse()?),
+                "--print-seconds" => {
+                    print_seconds = value()?.parse().map_err(|_| "--print-seconds needs a whole number".to_owned())?;
+                }
                 "--shell" => shell = true,
                 _ => return Ok(false),
             }
             Ok(true)
         });
-        Options { show_output: arguments.show_output, arguments, flavour, programs, list, shell }
+        Options { show_output: arguments.show_output, arguments, flavour, programs, print_seconds, list, shell }
     }
 
     /// Whether the test runs on this flavor. The name is the test's name in the report.

@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::emulator::{Emulator, SILENCE_MAX};
+use super::cache_lines::CacheLines;
+use super::emulator::Emulator;
 use super::guest_program::OtherProgram;
 use super::report::{Outcome, Report};
 use super::snapshot::Snapshot;
@@ -20,7 +21,15 @@ use pinion_testkit::kernel::{Flavour, Kernel};
 
 pub const EMULATOR: &str = "qemu-system-x86_64";
 
+/// init.sh ends a test after this time of the guest, and a print's time.
+const TEST_S: u32 = 90;
+
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Longest processor time of the emulator for a second of a busy guest.
+const SECOND: Duration = Duration::from_secs(10);
+/// Longest silence by the computer's clock, beyond that time, for an emulator that uses no processor time.
+const STALL_MAX: Duration = Duration::from_secs(3600);
 
 /// QEMU's exit code from init after all tests of the plan.
 const EXIT_PLAN_DONE: i32 = 33;
@@ -47,6 +56,7 @@ pub struct Run<'a> {
     pub flavour: Flavour,
     /// The measured program, if it is not Pinion.
     pub program: Option<&'a OtherProgram>,
+    pub print_seconds: u32,
     pub tests: Vec<String>,
 }
 
@@ -72,20 +82,24 @@ impl Run<'_> {
         let folder = folder.path();
         let plan = folder.join("plan");
         let program = self.program.map(OtherProgram::command).unwrap_or_default();
-        let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
+        let text: String = self.tests.iter().map(|test| format!("{test} {} {program}\n", self.print_seconds)).collect();
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
         let mut vm = vm(folder)?;
         vm.args(TIME)
             // The file that `-kernel` put into the VM that was booted.
             .args(["-option-rom", "pvh.bin", "-incoming", &snapshot.source(), "-fw_cfg"])
             .arg(format!("name=opt/pinion/plan,file={}", plan.display()));
+        let lines = CacheLines::of(&self.tests, folder)?;
+        if let Some(lines) = &lines {
+            vm.arg("-plugin").arg(lines.option());
+        }
         let mut emulator = Emulator::start(vm, folder)?;
         emulator.wait_until(|status| status != "inmigrate")?;
         emulator.ask(json!({"execute": "cont"}))?;
 
-        let cause = follow(&mut emulator)?;
+        let cause = follow(&mut emulator, SECOND * (TEST_S + self.print_seconds))?;
         let share = folder.join("share");
-        let count = self.report_results(&share, report)?;
+        let count = self.report_results(&share, lines.as_ref(), report)?;
         keep_profiles(&share)?;
         if count < self.tests.len() {
             let console = emulator.console();
@@ -104,7 +118,12 @@ impl Run<'_> {
     }
 
     /// Reports the guest's results from the folder, and returns their number.
-    fn report_results(&self, share: &Path, report: &Mutex<&mut Report>) -> Result<usize, String> {
+    fn report_results(
+        &self,
+        share: &Path,
+        lines: Option<&CacheLines>,
+        report: &Mutex<&mut Report>,
+    ) -> Result<usize, String> {
         let results = fs::read_to_string(share.join("results")).unwrap_or_default();
         let mut reported = 0;
         // A line without an end was still being written.
@@ -114,9 +133,18 @@ impl Run<'_> {
                 return Err(format!("the guest reported {line:?}, which was not its next test"));
             }
             let output = fs::read(share.join("output").join(test)).unwrap_or_default();
-            let output = String::from_utf8_lossy(&output);
+            let mut output = String::from_utf8_lossy(&output).into_owned();
             // libtest reports success for a name that the program does not know.
-            let passed = status == "0" && output.contains("test result: ok. 1 passed;");
+            let mut passed = status == "0" && output.contains("test result: ok. 1 passed;");
+            if let Some(lines) = lines {
+                match lines.figures() {
+                    Ok(figures) => output += &figures,
+                    Err(cause) => {
+                        output += &cause;
+                        passed = false;
+                    }
+                }
+            }
             let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
             report.lock().expect("no VM panics").test(self, test, outcome, &output);
             reported += 1;
@@ -143,10 +171,11 @@ fn keep_profiles(share: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Waits until the VM has ended. Returns how it ended, for the tests without a result.
-fn follow(emulator: &mut Emulator) -> Result<String, String> {
+/// Waits until the VM has ended. Returns how it ended, for the tests without a result. The silence is processor time of
+/// the emulator: a busy computer stops it, and the guest.
+fn follow(emulator: &mut Emulator, silence_max: Duration) -> Result<String, String> {
     let mut said = 0;
-    let mut heard = Instant::now();
+    let mut heard = (Instant::now(), emulator.processor_time()?);
     loop {
         if let Some(status) = emulator.ended()? {
             return Ok(match status.code() {
@@ -157,10 +186,16 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
         // The console shows each test's name when it starts.
         let length = emulator.console().len();
         if length != said {
-            (said, heard) = (length, Instant::now());
+            (said, heard) = (length, (Instant::now(), emulator.processor_time()?));
         }
-        if heard.elapsed() > SILENCE_MAX {
-            return Ok(format!("no result for {} s: stopped", SILENCE_MAX.as_secs()));
+        let (since, spent) = heard;
+        let silence = emulator.processor_time()?.saturating_sub(spent);
+        if silence > silence_max || since.elapsed() > STALL_MAX + silence_max {
+            return Ok(format!(
+                "no result for {} s, with {} s of processor time: stopped",
+                since.elapsed().as_secs(),
+                silence.as_secs()
+            ));
         }
         thread::sleep(POLL_INTERVAL);
     }

@@ -9,8 +9,6 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use nix::time::ClockId;
-use nix::unistd::Pid;
 use tempfile::TempDir;
 
 use super::board::Board;
@@ -167,13 +165,13 @@ impl Vm {
 
     /// The console's next line.
     fn line(&self) -> Result<String, String> {
-        let (since, spent) = (Instant::now(), self.processor_time()?);
+        let (since, spent) = (Instant::now(), process::processor_time(&self.qemu)?);
         loop {
             match self.lines.recv_timeout(MEASURE_INTERVAL) {
                 Ok(line) => return Ok(line),
                 Err(RecvTimeoutError::Disconnected) => return Err("the VM ended too early".to_owned()),
                 Err(RecvTimeoutError::Timeout) => {
-                    let silence = self.processor_time()?.saturating_sub(spent);
+                    let silence = process::processor_time(&self.qemu)?.saturating_sub(spent);
                     if silence > SILENCE_MAX || since.elapsed() > STALL_MAX {
                         return Err(format!(
                             "nothing came from it for {} s, with {} s of processor time",
@@ -184,13 +182,6 @@ impl Vm {
                 }
             }
         }
-    }
-
-    /// The emulator's use of processor time.
-    fn processor_time(&self) -> Result<Duration, String> {
-        let process = Pid::from_raw(self.qemu.id().cast_signed());
-        let time = ClockId::pid_cpu_clock_id(process).and_then(ClockId::now);
-        time.map(Duration::from).map_err(|error| format!("the emulator's processor time is unknown: {error}"))
     }
 
     /// The whole output of the guest and the emulator.

@@ -5,6 +5,7 @@
 //! Only Pinion's figures are asserted.
 
 mod print;
+mod uart;
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -386,6 +387,13 @@ fn most_steps_with_registers() {
     if is_pinion() {
         most_steps_by("Steps a second with registers, the same, thousands", Way::Registers);
     }
+}
+
+/// The computer's side counts: see `tests/kernel/cache_lines.rs`. The processor is idle before each edge.
+#[test]
+fn cache_lines() {
+    let load = Load::steady(1, 40, 1, false);
+    Session::start(Way::Kernel).run(&load, |_| ()).expect("steps");
 }
 
 fn instructions_an_edge(session: &mut Session, load: &Load, _: &str) -> Result<String, String> {

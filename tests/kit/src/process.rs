@@ -4,6 +4,10 @@
 use std::fs::File;
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
+use std::time::Duration;
+
+use nix::time::ClockId;
+use nix::unistd::Pid;
 
 /// The command's output. An error contains its output and standard error.
 pub fn output(command: &mut Command) -> Result<String, String> {
@@ -47,6 +51,12 @@ pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, Ch
     let input = emulator.stdin.take().expect("a pipe was asked for");
     let output = emulator.stdout.take().expect("a pipe was asked for");
     Ok((emulator, input, output))
+}
+
+/// The processor time of a running child so far. An emulator that a busy computer stops uses none.
+pub fn processor_time(child: &Child) -> Result<Duration, String> {
+    let time = ClockId::pid_cpu_clock_id(Pid::from_raw(child.id().cast_signed())).and_then(ClockId::now);
+    time.map(Duration::from).map_err(|error| format!("the emulator's processor time is unknown: {error}"))
 }
 
 /// Runs a shell pipeline. It fails if any part of the pipeline fails. The words are passed as `$1`, `$2` and so on, and

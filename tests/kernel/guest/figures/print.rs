@@ -3,6 +3,7 @@
 //! late the MCU is, and how long klippy may stall.
 
 use std::collections::BTreeMap;
+use std::env;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use std::fs;
@@ -29,13 +30,18 @@ const FOLDER: &str = "/tmp/print";
 const END: u8 = 3;
 /// Time for klippy to start, and for the print to begin.
 const BEGIN: Duration = Duration::from_secs(5);
-/// The measured part of a print.
-const SPAN: Duration = Duration::from_secs(30);
-/// Length of the print's file: more than a test needs.
-const PRINT_S: f64 = 90.0;
+/// How much longer the print's file is than the measured part.
+const LONGER_S: f64 = 60.0;
+/// The trace has room for the edges of four minutes.
+const READ_TRACE: Duration = Duration::from_secs(60);
 /// A heater's software PWM shows how late the MCU is: an edge each millisecond.
 const PWM_LINE: u32 = 15;
 const PWM_EDGE_NS: u64 = 1_000_000;
+
+/// The measured part of a print: see `init.sh`.
+fn span() -> Duration {
+    Duration::from_secs(env::var("PRINT_SECONDS").ok().and_then(|text| text.parse().ok()).expect("a number of seconds"))
+}
 
 /// A print on four motors: a spiral at 100 mm/s, in lines of half a millimeter. X and Y make up to 8000 steps a second.
 struct Print {
@@ -169,7 +175,7 @@ fn spiral() -> String {
     const RADIUS_MM: f64 = 30.0;
     const LAYER_MM: f64 = 0.2;
     let mut text = format!("G90\nG1 F{}\n", MM_S * 60.0);
-    for line in 0..(PRINT_S * MM_S / LINE_MM) as u32 {
+    for line in 0..((span().as_secs_f64() + LONGER_S) * MM_S / LINE_MM) as u32 {
         let turns = f64::from(line) * LINE_MM / (TAU * RADIUS_MM);
         let (y, x) = (turns * TAU).sin_cos();
         let [x, y] = [x, y].map(|part| 100.0 + RADIUS_MM * part);
@@ -180,8 +186,9 @@ fn spiral() -> String {
 
 /// Prints, and figures how late the heater's edges were, beyond the earliest of them. The earliest is late by the time
 /// that the program and the kernel need: see `edges_are_late`.
-fn late_in_print(of: &str) {
+fn late_in_print(beside: &str) {
     const CASE: &str = "a heater's software PWM";
+    let of = format!("{} s of a print {beside}", span().as_secs());
     let late_us = format!("{of}: edges late, us beyond the earliest: p50 / p99.9 / max");
     let mut print = Print::start();
     if !print.prints(&late_us, CASE) {
@@ -190,7 +197,11 @@ fn late_in_print(of: &str) {
     let trace = Trace::of_line(print.sim.kernel_number(PWM_LINE));
     let before = print.cpu_time();
     let from = Instant::now();
-    sleep(SPAN);
+    let mut edges = Vec::new();
+    while let Some(rest) = span().checked_sub(from.elapsed()).filter(|rest| !rest.is_zero()) {
+        sleep(rest.min(READ_TRACE));
+        edges = trace.writes();
+    }
     let (span, after) = (from.elapsed(), print.cpu_time());
     if !print.prints(&late_us, CASE) {
         return;
@@ -203,14 +214,13 @@ fn late_in_print(of: &str) {
         }
     }
 
-    let edges = trace.writes();
     drop(trace);
     let first = edges.first().expect("the heater's PWM").at_ns;
     let half = (PWM_EDGE_NS / 2) as i64;
     let mut late: Vec<i64> =
         edges.iter().map(|edge| ((edge.at_ns - first) as i64 + half).rem_euclid(PWM_EDGE_NS as i64) - half).collect();
     late.sort_unstable();
-    assert!(late.len() as u64 > SPAN.as_nanos() as u64 / PWM_EDGE_NS * 9 / 10, "{} edges", late.len());
+    assert!(late.len() as u64 > span.as_nanos() as u64 / PWM_EDGE_NS * 9 / 10, "{} edges", late.len());
     let us = |share: f64| (late[((late.len() - 1) as f64 * share) as usize] - late[0]) as f64 / 1000.0;
     figure(&late_us, CASE, &format!("{:.2} / {:.2} / {:.2}", us(0.5), us(0.999), us(1.0)));
     assert!(!is_pinion() || us(0.999) <= 200.0, "late by {} us", us(0.999));
@@ -218,13 +228,13 @@ fn late_in_print(of: &str) {
 
 #[test]
 fn shares() {
-    late_in_print("A print with klippy");
+    late_in_print("with klippy");
 }
 
 #[test]
 fn shares_beside_other_programs() {
     let _others = Others::start();
-    late_in_print("A print beside programs that copy and compress");
+    late_in_print("beside programs that copy and compress");
 }
 
 /// Stops klippy for longer and longer.
