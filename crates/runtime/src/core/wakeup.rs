@@ -39,9 +39,13 @@ impl Default for MarginLimits {
 }
 
 impl MarginLimits {
-    /// Bounds of 5 (3 for close timers) and `us` microseconds. A bound that is longer than `us` is `us`.
+    /// Bounds of 4.5 (3 for close timers) and `us` microseconds. A bound that is longer than `us` is `us`.
     pub fn up_to_us(us: u32) -> MarginLimits {
-        MarginLimits { min: Ticks::from_us(us.min(5)), close: Ticks::from_us(us.min(3)), max: Ticks::from_us(us) }
+        MarginLimits {
+            min: Ticks::from_us(us).min(Ticks(225)),
+            close: Ticks::from_us(us.min(3)),
+            max: Ticks::from_us(us),
+        }
     }
 
     /// These bounds, all the same.
@@ -312,7 +316,7 @@ mod tests {
     fn it_starts_above_the_wake_ups_that_were_tried() {
         let start = |late| Margin::new(MarginLimits::up_to_us(200), late).get();
         assert_eq!(start(4000), Ticks(5000));
-        assert_eq!((start(-5), start(10), start(i64::MAX)), (Ticks(250), Ticks(250), Ticks(10_000)));
+        assert_eq!((start(-5), start(10), start(i64::MAX)), (Ticks(225), Ticks(225), Ticks(10_000)));
     }
 
     #[test]
