@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Distributions of delays. Recording a sample does not allocate.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 use crate::time::{CLOCK_FREQ, Ticks};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Why the MCU stops: Klipper's short text for the wire, and a long text for the log.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::ops::Deref;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Times and spans in ticks of 20 ns, and the clocks of an MCU.
 
-#![forbid(unsafe_code)]
-
 use std::ops::{Add, Sub};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

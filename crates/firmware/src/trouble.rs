@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! An error, in one shape from the place where it happens to the place where it is printed.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 /// Something that went wrong. Only [`fmt::Display`] makes a sentence of it: `subject: cause: remedy`.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The MCU's requests to the hardware, and the interface of boards.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;

@@ -6,8 +6,6 @@
 //!
 //! [`Direction::OpenDrain`]: super::Direction::OpenDrain
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::{BusDevice, BusError, BusStatus, Line};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! SPI on GPIO lines, bit by bit.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use super::{BusDevice, BusError, ChipSelect, Line};

@@ -4,8 +4,6 @@
 //! After DRDY goes low, 24 clocks shift out a sample: 24 bits in two's complement, the highest bit first ("Data
 //! Format"). klippy itself sets up the chip.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Feature, JobSlot, Oid, command,

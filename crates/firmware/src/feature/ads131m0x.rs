@@ -4,8 +4,6 @@
 //! A frame has words of 24 bits: the response to the last command, a sample of each channel, and a CRC
 //! ("SPI Communication Frames"). The response to NULL is the STATUS register.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, DialectName::Kalico, DialectName::Master, Enumeration, Feature, JobSlot, Oid, command, since,

@@ -5,8 +5,6 @@
 //! next two registers, FIFO_CTL and FIFO_STATUS. FIFO_CTL must still hold klippy's value: this shows glitches on the
 //! wires. FIFO_STATUS has the number of samples, so no separate query comes first.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
     Command, DialectName::V0_12, DialectName::V0_13, Feature, Oid, Response, WireClock, command, since, until,

@@ -4,8 +4,6 @@
 //! A worker takes the readings, because each may block. If the ADC is slower than the host wants, samples are skipped.
 //! Timers and steps do not wait for it. A failed reading drops its sum.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
     Back, BusCounts, Calls, Command, Constant, Context, DeviceId, DialectName::Kalico, DialectName::Master,

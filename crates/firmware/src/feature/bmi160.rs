@@ -4,8 +4,6 @@
 //! Registers from its data sheet (Bosch, BST-BMI160-DS000: "Register (0x22-0x23) FIFO_LENGTH", "Register (0x24)
 //! FIFO_DATA"). klippy configures the FIFO for bare samples of the accelerometer.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{Command, DialectName::Master, Feature, Oid, command, since};
 use crate::time::Ticks;

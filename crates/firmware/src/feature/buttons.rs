@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Buttons: up to eight inputs, sampled together and debounced. Each change is reported until the host acknowledges it.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, Feature, Finished, InputLine, Next, Object, Oid, Response, Timer, WireClock, command, response,

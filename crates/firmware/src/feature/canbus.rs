@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Commands of a host on a CAN bus: the node's identity and the health of the bus (Klipper's canserial.c).
 
-#![forbid(unsafe_code)]
-
 use crate::board::Range;
 use crate::mcu::{
     CanHealth, CanNode, CanState, Command, Context, Enumeration, Feature, Response, Wire, command, response,

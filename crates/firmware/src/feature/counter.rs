@@ -8,8 +8,6 @@
 //! each one. So a level counts only after it has lasted a part of that time. The kernel can debounce a line too. But it
 //! mostly uses a timer in jiffies of 1 to 10 ms. A fan at 10,000 rpm has levels of 1.5 ms.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Edge, Edges, Pin};

@@ -2,8 +2,6 @@
 //! Digital outputs: queued changes, software PWM, and `max_duration`. `max_duration` limits how long an output may
 //! differ from its shutdown value without news from the host.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Timer, WireClock, command,

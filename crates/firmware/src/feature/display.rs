@@ -2,8 +2,6 @@
 //! Shared code of the displays on bare lines. A worker writes a command's bytes at the display's pace. The commands
 //! behind it wait.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};

@@ -5,8 +5,6 @@
 //! the bus while one of them measures: three take 2.25 s. So a `config_reset` does not wait for a reading. A reading is
 //! reported as soon as it arrives. Klipper's C reports it when the next one is due.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Thermometer;
 use crate::mcu::{
     Back, Command, Context, DeviceId, DialectName::Kalico, Dialects, Feature, Finished, Job, JobSlot, Next, Object,

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Endstops: a pin is sampled until it has a level several times in a row. Then a trsync is triggered.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, Feature, Finished, Hold, InputLine, Next, Object, Oid, Response, Sample, Timer, UNREAD_LIMIT,

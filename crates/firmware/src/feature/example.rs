@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The features of docs/develop/add-a-feature.md, which shows parts of these files. Only tests compile them.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{Feature, place_of_response};
 
 mod bell;

@@ -7,8 +7,6 @@
 //! v0.12 the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all jobs of a bus in order, and
 //! returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
     Back, Chip, Context, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Timer,

@@ -4,8 +4,6 @@
 //! The times are from Hitachi's data sheet at 5 V (HD44780U, "Bus timing characteristics"), as in Klipper's C. The
 //! host says how long the display needs after a byte.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{Command, Context, Feature, Oid, command};
 use crate::shutdown::Shutdown;

@@ -9,8 +9,6 @@
 //! are then all ones, and no check of the protocol would notice. So the worker measures every pulse. If one may have been
 //! too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
     Back, Command, Context, DeviceId, DeviceWarning, DialectName::Kalico, DialectName::Master, DialectName::V0_13,

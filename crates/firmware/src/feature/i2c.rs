@@ -6,8 +6,6 @@
 //! command runs, because klippy configures chips with one transfer after the other. A plain read is retried
 //! ([`BusDevice::read_register`](crate::board::BusDevice::read_register)). A transfer that writes is not.
 
-#![forbid(unsafe_code)]
-
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{

@@ -6,8 +6,6 @@
 //! and homing ends. The hosts v0.13 and Kalico do not know these errors. For them a failing bus stops the MCU, as it
 //! did in Klipper's C.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};

@@ -4,8 +4,6 @@
 //! Registers from their data sheets (ST, LIS2DW12 rev. 8: "FIFO_SAMPLES"; LIS3DH rev. 2: "FIFO_SRC_REG", "SPI read",
 //! "I2C operation").
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
     Command, DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Oid, Response, WireClock, command, only,

@@ -3,8 +3,6 @@
 //! the host has set, it pulls a trsync. A sample outside the safe range, grams that overflow, and a silent sensor also
 //! pull it. Each has a reason of its own. (Klipper's `trigger_analog` developed from this.)
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{
     Command, Context, DialectName::Kalico, Feature, Next, Object, Oid, Response, Timer, WireClock, command, response,
     since,

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The features of the MCU, one file each, and the list of all features.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Bias, Pin, Range};
 use crate::mcu::{Context, Feature, base, place_of_response};
 use crate::shutdown::{Shutdown, ShutdownReason};

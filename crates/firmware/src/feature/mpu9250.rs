@@ -4,8 +4,6 @@
 //!
 //! Registers from their register maps (InvenSense, RM-MPU-9250A-00, rev. 1.6; DS-000189, rev. 1.3).
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
     Command, DialectName::V0_12, DialectName::V0_13, Feature, Oid, Response, WireClock, command, since, until,

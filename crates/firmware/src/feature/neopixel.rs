@@ -5,8 +5,6 @@
 //! A data bit of the chain is a pulse: a short one is 0, a long one is 1. The chain takes its colors when the line has
 //! been low for a while.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Direction, Mosi, OnWorker, Pin};
 use crate::mcu::{
     Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Object, Oid, Response, command,

@@ -4,8 +4,6 @@
 //! Where Klipper's C waits in a loop, or has a timer for each bit, a worker waits in a loop here. So the core is
 //! free, and nothing has to wake up between two edges.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -3,8 +3,6 @@
 //!
 //! Registers and times are from NXP's data sheet, PCA9685 rev. 4.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};

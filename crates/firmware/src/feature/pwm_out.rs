@@ -2,8 +2,6 @@
 //! Hardware PWM outputs: queued values, and `max_duration`. `max_duration` limits how long an output may differ from
 //! its shutdown value without news from the host.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
     BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Present, Remote, Report, Safe,

@@ -9,8 +9,6 @@
 //! The core cannot read the line if it is the data input of an SPI controller. Then the worker polls as often, and reads
 //! the sample if there is one.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Bias, BusError, Direction, Line, Pin};

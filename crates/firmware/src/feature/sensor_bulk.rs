@@ -9,8 +9,6 @@
 //!
 //! Up to v0.12 each sensor had its own messages for this ([`Words`]). They are in the sensor's file.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{Context, DialectName::V0_13, Feature, Oid, Response, response, since};
 use crate::time::Clock;
 

@@ -4,8 +4,6 @@
 //! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals
 //! the result of Klipper's C to the bit, even if its 32-bit sums wrap.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{Command, DialectName::Kalico, DialectName::Master, Feature, Object, Oid, command, since};
 use crate::shutdown::{Shutdown, shutdowns};
 

@@ -6,8 +6,6 @@
 //! when the acknowledgement of the query arrives. Only a `spi_send` behind a `spi_send` to the same device does not
 //! wait. The worker runs them in their order. After a failure, or when the MCU stops, the rest is not sent.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};

@@ -5,8 +5,6 @@
 //! when each was due. An entry says by how much it came later (for the TLE5012B: the chip's own clock). A sensor gets
 //! one request at a time. Its latched measurement is read before a transfer of the host latches a new one.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{
     Back, Command, Context, DialectName::Kalico, DialectName::V0_12, DialectName::V0_13, Dialects, Enumeration,
     Feature, Finished, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,

@@ -5,8 +5,6 @@
 //! with its upper and its lower four bits in front (Sitronix' data sheet, "Serial interface"). The display executes a
 //! byte when its second half ends. So the time that the display needs passes before that.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{Command, Feature, Oid, command};
 use crate::shutdown::Shutdown;

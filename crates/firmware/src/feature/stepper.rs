@@ -2,8 +2,6 @@
 //! Steppers: queued moves, step pulses or both-edge steps, direction changes with their setup time, and a stop by a
 //! trsync.
 
-#![forbid(unsafe_code)]
-
 use std::ops::Range;
 
 use crate::board::Pin;

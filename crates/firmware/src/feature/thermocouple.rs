@@ -3,8 +3,6 @@
 //!
 //! The MCU passes the chip's word on, and klippy converts it to degrees.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
     Back, Command, Context, DialectName::Kalico, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid,

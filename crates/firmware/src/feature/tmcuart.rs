@@ -4,8 +4,6 @@
 //!
 //! The pins are GPIO lines (`lines.rs`) or a serial port of the computer (`port.rs`).
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Bias, Direction, OnWorker, Pin};
 use crate::mcu::{
     Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response,

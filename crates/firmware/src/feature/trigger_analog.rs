@@ -3,8 +3,6 @@
 //! host's value. Samples out of range, a filter overflow, an error of the sensor and a silent sensor also pull it. Each
 //! has a reason of its own.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{
     Command, Context, DialectName::Master, Enumeration, Feature, Next, Object, Oid, Response, Timer, WireClock,
     command, response, since,

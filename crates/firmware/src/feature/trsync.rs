@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Trsync: a trigger that stops several steppers at once, with a timeout and reports.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{Command, Context, Feature, Next, Object, Oid, Response, Timer, WireClock, command, response};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};

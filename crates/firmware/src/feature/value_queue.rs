@@ -2,8 +2,6 @@
 //! Queued values of an output, and `max_duration`. `max_duration` limits how long the output may differ from its
 //! shutdown value without news from the host. Hardware PWM channels and PCA9685 share this code.
 
-#![forbid(unsafe_code)]
-
 use crate::mcu::{Context, MoveQueue, Next, Timer};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::{Clock, Ticks};

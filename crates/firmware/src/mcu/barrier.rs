@@ -10,8 +10,6 @@
 //! follow its own on the same bus, in their order. Its block is finished at once. All other commands wait for the last
 //! of these jobs. So a display costs one wake-up for several messages.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Ticks;
 

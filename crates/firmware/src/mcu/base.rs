@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The commands that every MCU has: identify, clock, configuration, shutdown, debugging.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
 

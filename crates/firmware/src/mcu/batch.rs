@@ -5,8 +5,6 @@
 //! A batch has the timers that would have run one after the other. Its edges go out first. Then each object's event
 //! runs, and finds its edge made. So a direction that changes after a step still does, and no other order changes.
 
-#![forbid(unsafe_code)]
-
 use std::ptr;
 
 use crate::board::Bank;

@@ -5,8 +5,6 @@
 //! device at configuration. It asks that object for the chip when it sends a job, because klippy configures the sensor
 //! before it sets the SPI device's bus.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{BusDevice, BusError, OnWorker};
 use crate::shutdown::Shutdown;
 

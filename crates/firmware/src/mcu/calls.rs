@@ -8,8 +8,6 @@
 //! - A sampled input may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that stops a move has
 //!   no limit: its failure stops the MCU at once.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 

@@ -9,8 +9,6 @@
 //!
 //! The last setup decides if the line is an output or an input.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{ClaimedLine, Direction, Line, Pin};

@@ -2,8 +2,6 @@
 //! Declarations of commands and responses. A format, its typed parameters and its handler stand together. If they
 //! disagree, the build fails.
 
-#![forbid(unsafe_code)]
-
 use crate::board::{Board, Range};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_protocol::Malformed;

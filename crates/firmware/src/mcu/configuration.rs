@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host's configuration, and how the MCU forgets it.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::Shutdown;
 
 use super::base::Config;

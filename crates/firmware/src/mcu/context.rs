@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The context of a call to a feature: the operations that the feature may use.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::shutdown::Shutdown;

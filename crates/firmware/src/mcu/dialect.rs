@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The ids of all messages, and the dictionary that gives them to the host.
 
-#![forbid(unsafe_code)]
-
 use std::collections::HashMap;
 use std::io;
 

@@ -4,8 +4,6 @@
 //! To add a dialect, add it here with its name and its parent. It then has the parent's messages.
 //! docs/guide/dialects.md describes the remaining steps.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 use std::str::FromStr;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Input lines: the core reads them, or the worker of their chip.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};

@@ -9,8 +9,6 @@
 //!
 //! Commands wait for jobs that a command sent (`barrier.rs`).
 
-#![forbid(unsafe_code)]
-
 use std::any::Any;
 use std::marker::PhantomData;
 

@@ -3,8 +3,6 @@
 //!
 //! A job in its slot cannot be lost. It is here, or a worker has it. If it cannot be sent, it stays here.
 
-#![forbid(unsafe_code)]
-
 use std::any::Any;
 
 use crate::shutdown::Shutdown;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The level of a line: for the MCU's status, for a recorder of edges, and from a chip that may sleep.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How features claim a GPIO line: as an output, as an input, or for a job.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Bias, Board, CountedLine, Direction, Edges, Line, OnWorker, Pin};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The messages between host and MCU: commands, responses, and their dialect; notes for the log.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::shutdown::{Shutdown, reason};

@@ -4,8 +4,6 @@
 //! It does no I/O of its own. It reads the time from a given clock and calls the board's traits. It leaves its
 //! responses in an outbox. So all of it also runs in virtual time.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::Board;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The move queue: a fixed number of moves, shared by all objects that queue something.
 
-#![forbid(unsafe_code)]
-
 use std::collections::VecDeque;
 
 use crate::shutdown::{Shutdown, reason};

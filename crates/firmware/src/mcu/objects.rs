@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Objects: the host configures each under an oid. This file has the trait and the table.
 
-#![forbid(unsafe_code)]
-
 use std::any::Any;
 use std::mem;
 

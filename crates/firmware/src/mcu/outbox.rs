@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The MCU's output: responses for the host, and notes for the log.
 
-#![forbid(unsafe_code)]
-
 use crate::lateness::Lateness;
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Outputs: the lines that features drive, and how a stop drives them to their shutdown values.
 
-#![forbid(unsafe_code)]
-
 use std::mem;
 use std::sync::Arc;
 

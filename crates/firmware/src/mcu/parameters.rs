@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Parameter types of commands and responses, besides plain numbers and bytes.
 
-#![forbid(unsafe_code)]
-
 use std::fmt;
 
 use crate::board::Pin;

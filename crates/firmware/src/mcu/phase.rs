@@ -13,8 +13,6 @@
 //! `config_reset` leads from `Stopped` to `Empty`. It waits until every output is at its shutdown value.
 //! `clear_shutdown` leads from `Stopped` back to the phase before.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::Clock;
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Outputs that a worker writes, because writing may block: hardware PWM, lines of expanders.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::Shutdown;
 
 use super::{Back, Context, DeviceId, Finished, Hold, Job, JobSlot};

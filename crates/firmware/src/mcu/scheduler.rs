@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The MCU's time, and the timers that are due by it.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::lateness::Lateness;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How busy the core is: the sums for klippy's statistics.
 
-#![forbid(unsafe_code)]
-
 use crate::time::Ticks;
 
 /// The divisor of squares of ticks (`STATS_SUMSQ_BASE`).

@@ -10,8 +10,6 @@
 //! [`UNGUARDED_LIMIT`], because the end of the program would help nobody. It still retries them until the next
 //! configuration.
 
-#![forbid(unsafe_code)]
-
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks};
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The waiting timers: a queue ordered by due time, then by insertion order.
 
-#![forbid(unsafe_code)]
-
 use std::mem;
 
 use crate::time::Clock;

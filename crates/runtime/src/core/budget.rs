@@ -7,8 +7,6 @@
 //! running time, as the kernel counts it. It moves to another processor before its time on the present one is used up.
 //! If there is no other, it runs as SCHED_OTHER for a small part of a busy second. SCHED_OTHER is never throttled.
 
-#![forbid(unsafe_code)]
-
 use std::fs;
 use std::path::Path;
 use std::time::Duration;

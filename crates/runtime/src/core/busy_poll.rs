@@ -6,8 +6,6 @@
 //! needs that processor. Polling is rationed. So an endless series of jobs takes no processor from the host. Nor does
 //! it use up the time that the kernel allows real-time threads.
 
-#![forbid(unsafe_code)]
-
 use pinion_firmware::time::{Clock, Ticks};
 
 /// Longest time that a thread may poll without a break, after it has not polled for some time.

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Reasons to end the core's wait: work that it can do now.
 
-#![forbid(unsafe_code)]
-
 use rtrb::Consumer;
 
 use pinion_firmware::mcu::Mcu;

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The core runs the commands of blocks, and serves the link's other requests.
 
-#![forbid(unsafe_code)]
-
 use std::thread;
 
 use pinion_firmware::mcu::base;

@@ -14,8 +14,6 @@
 //! The guardian beats each time it listens. With its monitor (`monitors.rs`) the program notices a guardian that is
 //! stopped or hangs.
 
-#![forbid(unsafe_code)]
-
 use std::io;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;

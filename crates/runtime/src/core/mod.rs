@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The core owns the MCU. It runs due timers first, then commands while no timer is near. Otherwise it waits.
 
-#![forbid(unsafe_code)]
-
 pub(crate) mod budget;
 pub(crate) mod busy_poll;
 mod calls;

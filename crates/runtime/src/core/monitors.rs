@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The guardian's monitor of the core's heartbeat, and the program's monitor of the guardian's.
 
-#![forbid(unsafe_code)]
-
 use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The requests of the link to the core.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use pinion_firmware::mcu::Dialect;

@@ -3,8 +3,6 @@
 //! that does not fit its ring is dropped. Lines have a ring of their own. So the line with the reason of a stop gets
 //! through even if the host does not read its responses.
 
-#![forbid(unsafe_code)]
-
 use std::io::{self, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;

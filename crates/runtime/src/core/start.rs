@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The core's thread: its scheduling, and its rings to the link.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 

@@ -4,8 +4,6 @@
 //! The margin follows the upper quantile of the wake-ups' lateness. So most wake-ups come before the instant, and an
 //! edge is late only by the clock's own reading.
 
-#![forbid(unsafe_code)]
-
 use std::hint;
 use std::path::Path;
 use std::sync::Arc;

@@ -2,8 +2,6 @@
 //! Workers: each bus has a thread that runs the jobs to the bus's devices, one after the other. So the core never
 //! waits for a device.
 
-#![forbid(unsafe_code)]
-
 use std::any::Any;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Bells: struck at an instant.
 
-#![forbid(unsafe_code)]
-
 use crate::board::Pin;
 use crate::mcu::{
     Command, Context, Feature, Next, Object, Oid, OutputLine, Response, Timer, WireClock, command, response,

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Ears: sensors on SPI that hear a bell.
 
-#![forbid(unsafe_code)]
-
 use crate::board::BusError;
 use crate::feature::spi::{Spi, spi_shutdown};
 use crate::mcu::{

@@ -17,8 +17,6 @@
 //! the level of the last bit. If not, the chip stays on and measures, with 1.5 mA. At the start a high pulse longer than
 //! 60 us restarts the chip in any case.
 
-#![forbid(unsafe_code)]
-
 use crate::board::BusDevice;
 use crate::feature::spi::spi_shutdown;
 use crate::shutdown::Shutdown;

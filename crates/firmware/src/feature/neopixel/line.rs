@@ -11,8 +11,6 @@
 //! A call of the kernel takes longer than a short pulse. So a line without registers is refused. A line behind a bus that
 //! holds writes back is refused, too: the pulse at the line is not the pulse that was measured.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};

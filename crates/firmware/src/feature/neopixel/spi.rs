@@ -11,8 +11,6 @@
 //! whether a controller pauses during a message. The log names a controller that is known to pause. A frame counts as
 //! sent if its driver took it.
 
-#![forbid(unsafe_code)]
-
 use crate::board::BusDevice;
 use crate::feature::spi::spi_shutdown;
 use crate::shutdown::Shutdown;

@@ -17,8 +17,6 @@
 //! was a little late. The answer to a read counts only if none of its bits was late. So a late computer never reads a
 //! register wrong.
 
-#![forbid(unsafe_code)]
-
 use std::sync::Arc;
 
 use crate::board::{Bias, Direction, Line};

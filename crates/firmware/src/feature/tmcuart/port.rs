@@ -10,8 +10,6 @@
 //! A reply that does not come, or is not whole, is empty, as in Klipper's C. klippy then asks again. This is also the
 //! answer if the port fails. klippy stops the printer if it needed the answer.
 
-#![forbid(unsafe_code)]
-
 use std::time::Duration;
 
 use crate::board::SerialPort;
