@@ -108,7 +108,11 @@ fn changed(
 }
 
 fn comment_out(lines: &mut [String], number: usize) {
-    if let Some(line) = lines.get_mut(number - 1).filter(|line| !line.starts_with("# ")) {
-        line.insert_str(0, "# ");
+    // klippy ignores the whole SAVE_CONFIG block if a line has lost its mark.
+    const MARK: &str = "#*# ";
+    let Some(line) = lines.get_mut(number - 1).filter(|line| *line != MARK.trim_end()) else { return };
+    let at = if line.starts_with(MARK) { MARK.len() } else { 0 };
+    if !line[at..].starts_with("# ") {
+        line.insert_str(at, "# ");
     }
 }

@@ -233,11 +233,15 @@ fn a_copy_differs_only_where_asked_and_stays_in_its_folder() {
 fn a_copy_without_a_section_has_none_of_its_lines() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("printer.cfg");
-    fs::write(&path, "[a]\nx: 1\n  2\n[b]  # b\n[a]\n# y\ny: 3\n").unwrap();
+    let saved = "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*#\n#*# [a]\n#*# z =\n#*# \t1, 2\n#*#\n#*# [b]\n#*# z_offset = 1.5\n";
+    fs::write(&path, format!("[a]\nx: 1\n  2\n[b]  # b\n[a]\n# y\ny: 3\n{saved}")).unwrap();
     let config = Config::read(&path).unwrap();
     let gone = Change { section: "a".into(), left_out: true, without: Vec::new(), with: Vec::new() };
     let copied = write(&config, &[gone], &folder.path().join("copy")).unwrap();
     let text = fs::read_to_string(&copied).unwrap();
-    assert_eq!(text, "# [a]\n# x: 1\n#   2\n[b]  # b\n# [a]\n# y\n# y: 3\n");
-    assert!(Config::read(&copied).unwrap().section("a").is_none());
+    let saved = "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*#\n#*# # [a]\n#*# # z =\n#*# # \t1, 2\n#*#\n#*# [b]\n#*# z_offset = 1.5\n";
+    assert_eq!(text, format!("# [a]\n# x: 1\n#   2\n[b]  # b\n# [a]\n# y\n# y: 3\n{saved}"));
+    let again = Config::read(&copied).unwrap();
+    assert!(again.section("a").is_none());
+    assert_eq!(again.section("b").unwrap().text("z_offset"), Some("1.5"), "the block counts");
 }

@@ -22,8 +22,8 @@ const IDLE_REPEAT_COUNT: u32 = 100;
 const UNTIMED_MAX: u32 = 4;
 /// The time between two `stats` responses.
 const STATS_TICKS: Ticks = Ticks::from_ms(5000);
-/// Two timers for each object and three for the MCU.
-const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
+/// Two timers for each object, three for the MCU, and the running one, which may be started again.
+const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 4;
 
 /// The time, and the timers that wait for it.
 pub(super) struct Scheduler {

@@ -139,8 +139,8 @@ impl Timers {
         self.settle(at, timer);
     }
 
-    /// Inserts a timer after those with the same due time. A timer is in the queue at most once. So there are never
-    /// more entries than the objects have timers.
+    /// Inserts a timer after those with the same due time. A timer waits at most once, and the running one keeps its
+    /// place. So there is at most one entry more than timers.
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
         self.change(|timers| {
             debug_assert!(!timers.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");

@@ -111,7 +111,7 @@ pub(crate) fn steps() -> PossibleValuesParser {
     PossibleValuesParser::new(STEPS.iter().map(|step| step.name))
 }
 
-/// The klippy that is named, or the one of KLIPPER_DIR.
+/// The klippy for `--try`.
 ///
 /// # Errors
 ///

@@ -106,6 +106,10 @@ impl<'a> Trial<'a> {
     pub(super) fn still_ready(&mut self) -> Result<(), Outcome> {
         match self.host.state() {
             Ok((state, words)) if state != "ready" => Err(self.failed(words, None)),
+            Err(Refused::Gone(why)) => {
+                self.broken = Some("klippy ended".into());
+                Err(self.failed(format!("klippy is gone: {why}"), None))
+            }
             _ => Ok(()),
         }
     }
@@ -113,7 +117,7 @@ impl<'a> Trial<'a> {
     /// Runs G-code. The error is the outcome.
     pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
         match self.host.gcode(script, limit) {
-            // M400 ends without an error if klippy stops meanwhile.
+            // M400 ends without an error if klippy stops during it.
             Ok(()) => self.still_ready(),
             Err(Refused::Error(words)) => {
                 let words = self.why(words);
@@ -239,9 +243,15 @@ impl<'a> Trial<'a> {
         &self.own.config
     }
 
-    /// The place of a section.
+    /// The place of a section that klippy has.
     pub(super) fn place(&self, section: &str) -> Option<Place> {
-        self.config().section(section).map(|section| section.place.clone())
+        let section = self.config().section(section).filter(|section| !self.is_left_out(section))?;
+        Some(section.place.clone())
+    }
+
+    /// Whether klippy's copy is without a section.
+    pub(super) fn is_left_out(&self, section: &Section) -> bool {
+        self.folder.left_out.contains(&section.name)
     }
 
     /// Whether klippy has this object.

@@ -74,7 +74,7 @@ impl OwnArgs {
         if self.json { Form::Json } else { Form::Lines }
     }
 
-    /// The klippy that is named, for the command that a user copies.
+    /// The klippy that is named, or the one of KLIPPER_DIR.
     pub(crate) fn klipper(&self) -> Option<PathBuf> {
         self.klipper.clone().or_else(|| std::env::var_os("KLIPPER_DIR").map(PathBuf::from))
     }

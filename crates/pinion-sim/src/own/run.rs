@@ -56,6 +56,10 @@ impl Place {
         if args.in_place_pty {
             return own.mcus.iter().map(|mcu| in_place(own, mcu)).collect::<Result<_, _>>().map(Place::InPlace);
         }
+        if let Some(klipper) = args.klipper().filter(|klipper| args.without_plugins && !is_checkout(klipper)) {
+            let trouble = Trouble::new("there is no klippy/klippy.py in it").of(klipper.display());
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper"));
+        }
         let sections = own.config.sections().iter();
         let left_out: Vec<&str> = sections
             .filter(|section| args.without_plugins && lacks_module(section.kind(), args.klipper().as_deref()))
@@ -88,6 +92,10 @@ impl Place {
             }
         }
     }
+}
+
+fn is_checkout(klipper: &Path) -> bool {
+    klipper.join("klippy/klippy.py").is_file()
 }
 
 /// The path where klippy expects an MCU.

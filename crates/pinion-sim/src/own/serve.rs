@@ -137,6 +137,8 @@ pub(crate) struct Folder {
     pub(crate) printer_cfg: PathBuf,
     /// The links of all MCUs, the main one's first.
     pub(super) links: Vec<PathBuf>,
+    /// The sections that the copy does not have.
+    pub(crate) left_out: Vec<String>,
 }
 
 /// The section of an MCU.
@@ -208,7 +210,8 @@ impl Folder {
             with: Vec::new(),
         }));
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
-        Ok(Folder { path, printer_cfg, links })
+        let left_out = left_out.iter().map(|section| (*section).to_owned()).collect();
+        Ok(Folder { path, printer_cfg, links, left_out })
     }
 
     /// The command that starts klippy on the copy.

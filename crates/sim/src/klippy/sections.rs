@@ -15,6 +15,8 @@ pub(crate) struct Sections {
     offered: bool,
     /// Whether there is a section of a probe already. klippy accepts one.
     pub(crate) has_probe: bool,
+    /// Whether a chip is in `[resonance_tester]`. Its keys are of one chip.
+    pub(crate) has_resonance_tester: bool,
 }
 
 impl Sections {

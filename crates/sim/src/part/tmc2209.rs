@@ -7,7 +7,7 @@
 //! times of SENDDELAY. It counts the writes (IFCNT). It ignores a message that is for another address, or incomplete.
 //!
 //! Simulated: the UART by its edges; every register with its access and its reset value, the microstep counter and its
-//! currents, standstill and the time between steps, the inputs, StallGuard and DIAG (`trinamic.rs`). The motor turns as
+//! currents, standstill and the time between steps, the inputs, StallGuard and DIAG (`trinamic/`). The motor turns as
 //! with a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep, temperatures and faults, the automatic tuning of
 //! StealthChop, the pulse generator (VACTUAL), INDEX, and the effects of the OTP memory.
 

@@ -7,7 +7,7 @@
 //! is reset.
 //!
 //! Simulated: every register with its access and its reset value, the microstep counter and the currents of the wave
-//! table, standstill and the time between steps, the inputs, StallGuard, DIAG0 and DIAG1 (`trinamic.rs`). The [`Axis`]
+//! table, standstill and the time between steps, the inputs, StallGuard, DIAG0 and DIAG1 (`trinamic/`). The [`Axis`]
 //! simulates the motor. It turns whether or not the chip's power stage is on, and for any microstep setting. So a host
 //! can omit the chip's section. Only one setting affects the axis: which edges are steps (DEDGE).
 //!
@@ -155,12 +155,7 @@ impl<const MODEL: u16> Part for SpiDriverConfig<MODEL> {
             2130 => cfg.key("sense_resistor", 0.11),
             _ => cfg.key("sense_resistor", 0.075),
         }
-        if let Some(pin) = &self.diag1_pin {
-            // An open drain: a low level reports a stall.
-            let inverted = if pin.inverted { "" } else { "!" };
-            cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
-            offer_sensorless_homing(cfg, layout, &format!("tmc{MODEL}"), &self.axis, ("driver_SGT", 0));
-        }
+        stall_output(cfg, layout, &format!("tmc{MODEL}"), &self.axis, self.diag1_pin.as_ref());
     }
 }
 
@@ -241,6 +236,17 @@ impl Part for Tmc2240UartConfig {
         cfg.key("uart_address", self.address);
         cfg.key("run_current", 0.8);
         cfg.key("rref", 12000);
+        stall_output(cfg, layout, "tmc2240", &self.axis, self.diag1_pin.as_ref());
+    }
+}
+
+/// The key for DIAG1, and homing by it.
+fn stall_output(cfg: &mut Sections, layout: &Layout<'_>, driver: &str, axis: &str, diag1_pin: Option<&PinName>) {
+    if let Some(pin) = diag1_pin {
+        // An open drain: a low level reports a stall.
+        let inverted = if pin.inverted { "" } else { "!" };
+        cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
+        offer_sensorless_homing(cfg, layout, driver, axis, ("driver_SGT", 0));
     }
 }
 

@@ -8,7 +8,6 @@ use pinion_printer_config::Limit;
 use serde_json::Value;
 
 use super::{Seen, skipped};
-use crate::attempt::host::Host;
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial};
 
@@ -83,15 +82,16 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
         return skipped("there is no heater");
     }
     let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
-    let read = |host: &mut Host| {
-        let status = host.query(&objects).unwrap_or_default();
-        objects.iter().map(|name| celsius(&status, name)).collect::<Vec<f64>>()
+    let read = |trial: &mut Trial<'_>| match trial.host.query(&objects) {
+        Ok(status) => Ok(objects.iter().map(|name| celsius(&status, name)).collect::<Vec<f64>>()),
+        Err(refused) => Err(trial.failed(format!("klippy does not answer: {refused:?}"), None)),
     };
-    let hot = read(&mut trial.host);
+    let hot = read(trial)?;
     trial.gcode("TURN_OFF_HEATERS", LONG)?;
     let until = Instant::now() + HEAT;
     loop {
-        let now = read(&mut trial.host);
+        trial.still_ready()?;
+        let now = read(trial)?;
         let still = hot.iter().zip(&now).position(|(hot, now)| *hot > 45.0 && hot - now < 2.0);
         match still {
             None => return Ok("all heaters are off, and cool".into()),

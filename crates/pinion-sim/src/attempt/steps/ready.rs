@@ -8,7 +8,8 @@ use crate::own::{Kind, kind_of};
 
 pub(super) fn ready(trial: &mut Trial<'_>) -> Seen {
     if let Err(words) = trial.until_ready() {
-        let missing = trial.config().sections().iter().find(|section| kind_of(section.kind()) != Kind::Known);
+        let mut sections = trial.config().sections().iter().filter(|section| !trial.is_left_out(section));
+        let missing = sections.find(|section| kind_of(section.kind()) != Kind::Known);
         return Err(match (trial.failed(words, None), missing) {
             (Outcome::Failed { cause, place }, Some(section)) => {
                 Outcome::Failed { cause: format!("{cause} ([{}] is not simulated)", section.name), place }

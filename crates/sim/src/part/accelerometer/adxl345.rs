@@ -48,6 +48,8 @@ const TOP_RATE_HZ: f64 = 3200.0;
 const LSB_PER_G: [f64; 3] = [265.0, 265.0, 256.0];
 /// An offset's LSB is 15.6 mg, a sample's 3.9 mg.
 const LSB_PER_OFFSET: f64 = 4.0;
+
+/// The chip's registers and its FIFO.
 pub(super) struct Adxl345 {
     head: Head,
     /// By address; only the registers that hold what is written.

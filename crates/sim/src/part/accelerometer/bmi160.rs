@@ -64,6 +64,7 @@ impl Bmi160 {
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
         if self.get(FIFO_CONFIG_1) & (FIFO_ACC | FIFO_HEADER) != FIFO_ACC {
             self.fifo.clear();
+            self.taken = 0;
         }
         if std::mem::take(&mut self.fifo.overrun) {
             self.taken = 0;

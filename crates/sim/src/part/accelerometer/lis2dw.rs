@@ -37,7 +37,7 @@ const FIFO_EMPTY: u8 = 0x20;
 /// Entries of the FIFO.
 const FIFO: usize = 32;
 
-/// What the two chips do not share.
+/// The differences between the two chips.
 pub(super) struct Model {
     id: u8,
     /// Registers that do not start as zero.

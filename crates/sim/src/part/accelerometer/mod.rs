@@ -69,7 +69,7 @@ pub struct AccelerometerConfig {
     /// The kind of chip.
     #[serde(default)]
     pub chip: AccelerometerChip,
-    /// Tells several of them apart.
+    /// Distinguishes several of them.
     pub name: Option<String>,
     /// Its SPI or I2C bus.
     pub bus: String,
@@ -177,7 +177,7 @@ impl Part for AccelerometerConfig {
                 cfg.key("i2c_address", address);
             }
         }
-        if !layout.has_head() {
+        if !layout.has_head() || std::mem::replace(&mut cfg.has_resonance_tester, true) {
             return;
         }
         // klippy shakes the head at this place.

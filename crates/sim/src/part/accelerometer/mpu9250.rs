@@ -43,6 +43,16 @@ pub(super) struct Map {
 
 type Registers = [[u8; 0x80]; 4];
 
+impl Map {
+    /// The registers at power-up: the best clock, and an ICM-20948 sleeps.
+    fn resets(&self) -> Registers {
+        let mut registers = [[0; 0x80]; 4];
+        registers[0][usize::from(self.who_am_i.0)] = self.who_am_i.1;
+        registers[0][usize::from(self.pwr_mgmt_1)] = if self.bank_sel.is_some() { SLEEP | 1 } else { 1 };
+        registers
+    }
+}
+
 pub(super) const MPU9250: Map = Map {
     who_am_i: (0x75, 0x71),
     pwr_mgmt_1: 0x6b,
@@ -97,10 +107,7 @@ pub(super) struct Mpu {
 
 impl Mpu {
     pub(super) fn new(map: &'static Map, head: Head) -> Mpu {
-        let mut registers = [[0; 0x80]; 4];
-        registers[0][usize::from(map.who_am_i.0)] = map.who_am_i.1;
-        // The best clock; an ICM-20948 also sleeps.
-        registers[0][usize::from(map.pwr_mgmt_1)] = if map.bank_sel.is_some() { SLEEP | 1 } else { 1 };
+        let registers = map.resets();
         Mpu { map, head, registers, bank: 0, fifo: Fifo::new(FIFO / SAMPLE), taken: 0, is_sampling: false }
     }
 
@@ -113,9 +120,8 @@ impl Mpu {
         let (bank, register, shift) = self.map.accel_config;
         let range = self.registers[bank][usize::from(register)] >> shift & 3;
         let lsb_per_g = LSB_PER_G / f64::from(1u32 << range);
-        let before = self.fifo.samples.len();
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
-        if self.fifo.overrun && before < self.fifo.samples.len() {
+        if self.fifo.overrun && room.replaces {
             self.taken = 0;
         }
         if std::mem::take(&mut self.fifo.overrun) {
@@ -193,8 +199,9 @@ impl Chip for Mpu {
             self.taken = 0;
         }
         if self.bank == 0 && register == self.map.pwr_mgmt_1 && value & RESET != 0 {
-            self.registers = [[0; 0x80]; 4];
-            self.registers[0][usize::from(self.map.who_am_i.0)] = self.map.who_am_i.1;
+            self.registers = self.map.resets();
+            self.fifo.clear();
+            (self.bank, self.taken) = (0, 0);
         }
         self.set_up();
     }
@@ -276,6 +283,10 @@ mod tests {
             assert_eq!(count(&mut bench, map), 510, "it is full");
             assert_ne!(bench.i2c_read(map.overflow.0), [0]);
             assert_eq!(bench.i2c_read(map.overflow.0), [0], "a read clears it");
+            bench.i2c_write(map.pwr_mgmt_1, RESET);
+            assert_eq!(bench.i2c_read(map.pwr_mgmt_1), [map.resets()[0][usize::from(map.pwr_mgmt_1)]]);
+            assert_eq!(count(&mut bench, map), 0, "a reset empties it");
+            writes.iter().for_each(|(register, value)| bench.i2c_write(*register, *value));
             bench.i2c_write(map.pwr_mgmt_1, SLEEP);
             bench.i2c_write(map.user_ctrl, FIFO_EN | map.fifo_reset);
             bench.wait(1.0);
