@@ -45,7 +45,7 @@ pub(crate) struct OwnArgs {
     /// The folder for klippy's copy and its logs; a new one in /tmp by default
     #[arg(long, value_name = "DIR", conflicts_with = "in_place_pty")]
     pub(crate) folder: Option<PathBuf>,
-    /// Leave the sections out of klippy's copy for which it has no module, for example [shaketune]. Without --klipper:
+    /// Leave the sections out of klippy's copy for which it has no module, for example of shaketune. Without --klipper:
     /// which neither Klipper nor Kalico has
     #[arg(long, conflicts_with = "in_place_pty")]
     pub(crate) without_plugins: bool,

@@ -184,7 +184,7 @@ pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
     !is_built_in && !["extras", "plugins"].into_iter().any(has)
 }
 
-/// Whether klippy loads nothing for this [probe], because a section before it has made the probe. SAVE_CONFIG leaves such
+/// Whether klippy loads nothing for this `[probe]`, because a section before it has made the probe. SAVE_CONFIG leaves such
 /// sections behind. A section of somebody's module may have made it.
 pub(super) fn is_left_over(config: &Config, section: &Section) -> bool {
     const PROBES: [&str; 4] = ["bltouch", "load_cell_probe", "probe_eddy_current", "smart_effector"];

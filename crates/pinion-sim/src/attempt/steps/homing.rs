@@ -44,7 +44,7 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
     Ok(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
 }
 
-/// How far klippy's position is from the nozzle's along the axes of which [homing_override] only says where they are: a
+/// How far klippy's position is from the nozzle's along the axes of which `[homing_override]` only says where they are: a
 /// belt. `homed` has checked that the others agree.
 pub(super) fn said_mm(trial: &mut Trial<'_>) -> Result<[f64; 3], Outcome> {
     let Some(over) = trial.config().section("homing_override") else { return Ok([0.0; 3]) };
