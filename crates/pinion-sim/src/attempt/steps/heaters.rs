@@ -42,25 +42,8 @@ pub(super) fn heated(trial: &mut Trial<'_>) -> Seen {
     if targets.is_empty() {
         return skipped("there is no heater");
     }
-    for (name, target) in &targets {
-        trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={} TARGET={target}", own_name(name)), LONG)?;
-    }
-    let until = Instant::now() + HEAT;
+    heat(trial, &targets)?;
     let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
-    loop {
-        let status = match trial.host.query(&objects) {
-            Ok(status) => status,
-            Err(refused) => return Err(trial.failed(format!("klippy does not answer: {refused:?}"), None)),
-        };
-        let cold = targets.iter().find(|(name, target)| (celsius(&status, name) - target).abs() > NEAR_K);
-        let Some((name, target)) = cold else { break };
-        trial.still_ready()?;
-        if Instant::now() > until {
-            let cause = format!("{name} is at {:.0} of {target} C", celsius(&status, name));
-            return Err(trial.failed(cause, trial.place(name)));
-        }
-        thread::sleep(Duration::from_millis(500));
-    }
     // klippy's reading has to be the heater's temperature.
     let status = trial.host.query(&objects).unwrap_or_default();
     for name in objects {
@@ -103,28 +86,33 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     }
 }
 
-/// Heats a heater, and waits until it has its target.
-pub(super) fn heat(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outcome> {
-    let Some((_, target)) = targets(trial).into_iter().find(|(name, _)| name == heater) else { return Ok(()) };
-    trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={} TARGET={target}", own_name(heater)), LONG)?;
-    until_hot(trial, heater)
+/// Heats the extruder for a print.
+pub(super) fn heat_extruder(trial: &mut Trial<'_>) -> Result<(), Outcome> {
+    let mut targets = targets(trial);
+    targets.retain(|(name, _)| name == "extruder");
+    heat(trial, &targets)
 }
 
-/// Waits until a heater has its target.
-fn until_hot(trial: &mut Trial<'_>, heater: &str) -> Result<(), Outcome> {
+/// Heats, and waits until all have their targets.
+fn heat(trial: &mut Trial<'_>, targets: &[(String, f64)]) -> Result<(), Outcome> {
+    for (name, target) in targets {
+        trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={} TARGET={target}", own_name(name)), LONG)?;
+    }
     let until = Instant::now() + HEAT;
+    let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
     loop {
-        let status = trial.host.query(&[heater]).unwrap_or_default();
-        let now = celsius(&status, heater);
-        let target = status[heater]["target"].as_f64().unwrap_or_default();
-        if (now - target).abs() < NEAR_K {
-            return Ok(());
-        }
+        let status = match trial.host.query(&objects) {
+            Ok(status) => status,
+            Err(refused) => return Err(trial.failed(format!("klippy does not answer: {refused:?}"), None)),
+        };
+        let cold = targets.iter().find(|(name, target)| (celsius(&status, name) - target).abs() > NEAR_K);
+        let Some((name, target)) = cold else { return Ok(()) };
         trial.still_ready()?;
         if Instant::now() > until {
-            return Err(trial.failed(format!("{heater} is at {now:.0} of {target} C"), None));
+            let cause = format!("{name} is at {:.0} of {target} C", celsius(&status, name));
+            return Err(trial.failed(cause, trial.place(name)));
         }
-        thread::sleep(Duration::from_millis(300));
+        thread::sleep(Duration::from_millis(500));
     }
 }
 

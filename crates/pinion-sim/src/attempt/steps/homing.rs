@@ -26,11 +26,7 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
     }
     let nozzle = trial.probe.nozzle_mm();
     // A belt as z axis has no end: [homing_override] says where it is, and does not move it.
-    let over = trial.config().section("homing_override");
-    let is_said = |axis: usize| {
-        start[axis] == nozzle[axis]
-            && over.is_some_and(|over| over.text(&format!("set_position_{}", AXES[axis])).is_some())
-    };
+    let is_said = |axis: usize| start[axis] == nozzle[axis] && has_said_place(trial, axis);
     // A probe that homes z finds the bed within its own distance of a step, and a mesh may be in force.
     let off = coordinates(&toolhead["position"]).into_iter().zip(nozzle).map(|(klippys, real)| (klippys - real).abs());
     let far = off.enumerate().find(|(axis, off)| *off > NEAR_MM && !is_said(*axis));
@@ -47,14 +43,18 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
 /// How far klippy's position is from the nozzle's along the axes of which `[homing_override]` only says where they are: a
 /// belt. `homed` has checked that the others agree.
 pub(super) fn said_mm(trial: &mut Trial<'_>) -> Result<[f64; 3], Outcome> {
-    let Some(over) = trial.config().section("homing_override") else { return Ok([0.0; 3]) };
     let klippys = coordinates(&trial.toolhead()?["position"]);
     let nozzle = trial.probe.nozzle_mm();
     Ok([0, 1, 2].map(|axis| {
-        let is_said = over.text(&format!("set_position_{}", AXES[axis])).is_some();
         let off = klippys[axis] - nozzle[axis];
-        if is_said && off.abs() > NEAR_MM { off } else { 0.0 }
+        if has_said_place(trial, axis) && off.abs() > NEAR_MM { off } else { 0.0 }
     }))
+}
+
+/// Whether `[homing_override]` says where an axis is.
+fn has_said_place(trial: &Trial<'_>, axis: usize) -> bool {
+    let over = trial.config().section("homing_override");
+    over.is_some_and(|over| over.text(&format!("set_position_{}", AXES[axis])).is_some())
 }
 
 /// Whether klippy's position is the nozzle's: nothing is between them, and the bed does not change it.

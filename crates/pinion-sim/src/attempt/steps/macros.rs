@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The macros that begin and end a print.
 
-use super::heaters::heat;
+use super::heaters::heat_extruder;
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial};
@@ -27,7 +27,7 @@ pub(super) fn macros(trial: &mut Trial<'_>) -> Seen {
         match trial.gcode(&script, LONG) {
             // Some expect that the slicer has heated before.
             Err(Outcome::Failed { cause, .. }) if cause.contains("Extrude below minimum temp") => {
-                heat(trial, "extruder")?;
+                heat_extruder(trial)?;
                 trial.gcode(&script, LONG)?;
             }
             result => result?,

@@ -10,7 +10,7 @@ use pinion::cli::files;
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_sim::{AskedPath, PathPoint, Recorder, compare};
 
-use super::heaters::heat;
+use super::heaters::heat_extruder;
 use super::homing::said_mm;
 use super::square::square;
 use super::{Seen, skipped};
@@ -82,7 +82,7 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
         return Ok(());
     }
     trial.gcode("G28", LONG)?;
-    heat(trial, "extruder")
+    heat_extruder(trial)
 }
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.

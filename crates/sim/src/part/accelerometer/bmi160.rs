@@ -6,7 +6,7 @@
 //! first message.
 
 use super::Chip;
-use super::head::{Fifo, Head, Room, value};
+use super::head::{Fifo, Head, Room, SAMPLE, value};
 
 const CHIP_ID: u8 = 0x00;
 const ID: u8 = 0xd1;
@@ -27,9 +27,8 @@ const FIFO_ACC: u8 = 0x40;
 const FIFO_HEADER: u8 = 0x10;
 /// The accelerometer in PMU_STATUS.
 const NORMAL: u8 = 0x10;
-/// Bytes of the FIFO, and of a sample.
+/// Bytes of the FIFO.
 const FIFO: usize = 1024;
-const SAMPLE: usize = 6;
 /// Registers that do not start as zero.
 const RESETS: [(u8, u8); 6] =
     [(CHIP_ID, ID), (ACC_CONF, 0x28), (ACC_RANGE, 0x03), (0x45, 0x88), (0x46, 0x80), (FIFO_CONFIG_1, FIFO_HEADER)];
@@ -38,15 +37,13 @@ pub(super) struct Bmi160 {
     head: Head,
     registers: [u8; 0x80],
     fifo: Fifo,
-    /// Bytes of the oldest sample that were read.
-    taken: usize,
 }
 
 impl Bmi160 {
     pub(super) fn new(head: Head) -> Bmi160 {
         let mut registers = [0; 0x80];
         RESETS.iter().for_each(|(register, reset)| registers[usize::from(*register)] = *reset);
-        Bmi160 { head, registers, fifo: Fifo::new(FIFO / SAMPLE), taken: 0 }
+        Bmi160 { head, registers, fifo: Fifo::new(FIFO / SAMPLE) }
     }
 
     fn get(&self, register: u8) -> u8 {
@@ -64,10 +61,6 @@ impl Bmi160 {
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
         if self.get(FIFO_CONFIG_1) & (FIFO_ACC | FIFO_HEADER) != FIFO_ACC {
             self.fifo.clear();
-            self.taken = 0;
-        }
-        if std::mem::take(&mut self.fifo.overrun) {
-            self.taken = 0;
         }
     }
 
@@ -91,20 +84,11 @@ impl Chip for Bmi160 {
     }
 
     fn read(&mut self, register: u8) -> u8 {
-        let [low, high] = ((self.fifo.samples.len() * SAMPLE - self.taken) as u16).to_le_bytes();
+        let [low, high] = self.fifo.bytes().to_le_bytes();
         match register {
             FIFO_LENGTH => low,
             register if register == FIFO_LENGTH + 1 => high,
-            FIFO_DATA => {
-                let byte = self.fifo.front()[self.taken / 2].to_le_bytes()[self.taken % 2];
-                if !self.fifo.samples.is_empty() {
-                    self.taken = (self.taken + 1) % SAMPLE;
-                    if self.taken == 0 {
-                        self.fifo.pop();
-                    }
-                }
-                byte
-            }
+            FIFO_DATA => self.fifo.next_byte(i16::to_le_bytes),
             _ => self.get(register),
         }
     }
@@ -115,10 +99,7 @@ impl Chip for Bmi160 {
                 self.registers[usize::from(PMU_STATUS)] = if value == ACC_NORMAL { NORMAL } else { 0 };
                 self.set_up();
             }
-            (CMD, FIFO_FLUSH) => {
-                self.fifo.clear();
-                self.taken = 0;
-            }
+            (CMD, FIFO_FLUSH) => self.fifo.clear(),
             (ACC_CONF.., _) => {
                 self.registers[usize::from(register & 0x7f)] = value;
                 if register == ACC_CONF {

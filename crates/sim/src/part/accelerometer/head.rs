@@ -54,16 +54,39 @@ pub(super) struct Fifo {
     pub(super) shown: [i16; 3],
     /// A sample was lost.
     pub(super) overrun: bool,
+    /// Bytes of the oldest sample that were read, in a chip that gives its FIFO byte by byte.
+    taken: usize,
 }
+
+/// Bytes of a sample.
+pub(super) const SAMPLE: usize = 6;
 
 impl Fifo {
     pub(super) fn new(room: usize) -> Fifo {
-        Fifo { samples: VecDeque::with_capacity(room), shown: [0; 3], overrun: false }
+        Fifo { samples: VecDeque::with_capacity(room), shown: [0; 3], overrun: false, taken: 0 }
     }
 
     pub(super) fn clear(&mut self) {
         self.samples.clear();
         self.overrun = false;
+        self.taken = 0;
+    }
+
+    /// Bytes that nobody has read.
+    pub(super) fn bytes(&self) -> u16 {
+        (self.samples.len() * SAMPLE - self.taken) as u16
+    }
+
+    /// The next byte. `halves` is the order of a value's two bytes. An empty FIFO repeats the last sample's first one.
+    pub(super) fn next_byte(&mut self, halves: fn(i16) -> [u8; 2]) -> u8 {
+        let byte = halves(self.front()[self.taken / 2])[self.taken % 2];
+        if !self.samples.is_empty() {
+            self.taken = (self.taken + 1) % SAMPLE;
+            if self.taken == 0 {
+                self.pop();
+            }
+        }
+        byte
     }
 
     /// The sample that a host reads now.
@@ -165,6 +188,7 @@ impl Head {
                     break;
                 }
                 fifo.samples.pop_front();
+                fifo.taken = 0;
             }
             fifo.samples.push_back(digitize(g));
         }

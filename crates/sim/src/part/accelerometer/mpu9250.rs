@@ -6,15 +6,14 @@
 //! registers hold what is written. Not simulated: gyroscope, magnetometer, temperature, filters, interrupts.
 
 use super::Chip;
-use super::head::{Fifo, Head, Room, value};
+use super::head::{Fifo, Head, Room, SAMPLE, value};
 
 const SLEEP: u8 = 0x40;
 const RESET: u8 = 0x80;
 /// USER_CTRL.
 const FIFO_EN: u8 = 0x40;
-/// Bytes of the FIFO, and of a sample.
+/// Bytes of the FIFO.
 const FIFO: usize = 512;
-const SAMPLE: usize = 6;
 /// LSB per g at the smallest range. Each further range halves it.
 const LSB_PER_G: f64 = 16384.0;
 
@@ -100,15 +99,13 @@ pub(super) struct Mpu {
     registers: Registers,
     bank: usize,
     fifo: Fifo,
-    /// Bytes of the oldest sample that were read.
-    taken: usize,
     is_sampling: bool,
 }
 
 impl Mpu {
     pub(super) fn new(map: &'static Map, head: Head) -> Mpu {
         let registers = map.resets();
-        Mpu { map, head, registers, bank: 0, fifo: Fifo::new(FIFO / SAMPLE), taken: 0, is_sampling: false }
+        Mpu { map, head, registers, bank: 0, fifo: Fifo::new(FIFO / SAMPLE), is_sampling: false }
     }
 
     fn get(&self, register: u8) -> u8 {
@@ -121,9 +118,6 @@ impl Mpu {
         let range = self.registers[bank][usize::from(register)] >> shift & 3;
         let lsb_per_g = LSB_PER_G / f64::from(1u32 << range);
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
-        if self.fifo.overrun && room.replaces {
-            self.taken = 0;
-        }
         if std::mem::take(&mut self.fifo.overrun) {
             let (register, bits) = self.map.overflow;
             self.registers[0][usize::from(register)] |= bits;
@@ -138,24 +132,6 @@ impl Mpu {
             self.is_sampling = samples;
             self.head.measure(samples.then(|| (self.map.rate_hz)(&self.registers)));
         }
-    }
-
-    fn count(&self) -> u16 {
-        (self.fifo.samples.len() * SAMPLE - self.taken) as u16
-    }
-
-    /// The next byte of the FIFO.
-    fn pop(&mut self) -> u8 {
-        let byte = self.fifo.front()[self.taken / 2].to_be_bytes()[self.taken % 2];
-        if self.fifo.samples.is_empty() {
-            return byte;
-        }
-        self.taken += 1;
-        if self.taken == SAMPLE {
-            self.taken = 0;
-            self.fifo.pop();
-        }
-        byte
     }
 }
 
@@ -172,12 +148,12 @@ impl Chip for Mpu {
     }
 
     fn read(&mut self, register: u8) -> u8 {
-        let [high, low] = self.count().to_be_bytes();
+        let [high, low] = self.fifo.bytes().to_be_bytes();
         match register {
             _ if self.bank != 0 => self.registers[self.bank][usize::from(register)],
             _ if register == self.map.fifo_count => high,
             _ if register == self.map.fifo_count + 1 => low,
-            _ if register == self.map.fifo_r_w => self.pop(),
+            _ if register == self.map.fifo_r_w => self.fifo.next_byte(i16::to_be_bytes),
             _ if register == self.map.overflow.0 => std::mem::take(&mut self.registers[0][usize::from(register)]),
             _ => self.get(register),
         }
@@ -196,12 +172,11 @@ impl Chip for Mpu {
         }
         if is_user_ctrl && value & self.map.fifo_reset != 0 {
             self.fifo.clear();
-            self.taken = 0;
         }
         if self.bank == 0 && register == self.map.pwr_mgmt_1 && value & RESET != 0 {
             self.registers = self.map.resets();
             self.fifo.clear();
-            (self.bank, self.taken) = (0, 0);
+            self.bank = 0;
         }
         self.set_up();
     }
