@@ -16,7 +16,7 @@ use crate::{Config, Trouble};
 const OUTSIDE: &str = "outside";
 
 /// A section that is another one in the copy.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Change {
     /// The whole name of the section.
     pub section: String,

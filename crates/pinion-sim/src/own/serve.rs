@@ -175,16 +175,16 @@ impl Folder {
         let links = links_of(&main, own.mcus.iter().map(String::as_str));
         let served = |(mcu, link): (&String, &PathBuf)| Change {
             section: section_of(mcu),
-            left_out: false,
             without: WAYS.map(str::to_owned).to_vec(),
             with: vec![("serial".into(), link.display().to_string()), ("restart_method".into(), "command".into())],
+            ..Change::default()
         };
         let mut changes: Vec<Change> = own.mcus.iter().zip(&links).map(served).collect();
         let elsewhere = |section: &str, key: &str, value: &Path| Change {
             section: section.into(),
-            left_out: false,
             without: vec![key.into()],
             with: vec![(key.into(), value.display().to_string())],
+            ..Change::default()
         };
         changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
         let is_of_host = |section: &&Section| section.text("sensor_type") == Some("temperature_host");
@@ -206,8 +206,7 @@ impl Folder {
         changes.extend(left_out.iter().map(|section| Change {
             section: (*section).to_owned(),
             left_out: true,
-            without: Vec::new(),
-            with: Vec::new(),
+            ..Change::default()
         }));
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
         let left_out = left_out.iter().map(|section| (*section).to_owned()).collect();

@@ -22,7 +22,7 @@ use super::trinamic::registers::{
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
-use super::uart::{UartChip, send_delay};
+use super::uart::{UartChip, check_pins, select_keys, send_delay};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
@@ -127,12 +127,7 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         if self.uart_port.is_some() && self.tx_pin.is_some() {
             return wrong(whose, "tx_pin", "a serial port sends and receives", "remove it");
         }
-        let pins = [("uart_pin", &self.uart_pin), ("tx_pin", &self.tx_pin), ("uart_port", &self.uart_port)];
-        for (key, pin) in pins {
-            if pin.as_ref().is_some_and(|pin| pin.inverted) {
-                return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
-            }
-        }
+        check_pins(whose, self.uart_pins().into_iter().chain([("uart_port", self.uart_port.as_ref())]))?;
         printer.check_axis(whose, &self.axis)
     }
 
@@ -150,10 +145,7 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
         cfg.key_if("uart_pin", self.uart_pin.as_ref());
         cfg.key_if("uart_pin", self.uart_port.as_ref());
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
-        if !self.select_pins.is_empty() {
-            let pins: Vec<String> = self.select_pins.iter().map(ToString::to_string).collect();
-            cfg.key("select_pins", pins.join(", "));
-        }
+        select_keys(cfg, &self.select_pins);
         if MODEL == 2209 {
             cfg.key("uart_address", self.address);
         }

@@ -25,7 +25,7 @@ use super::trinamic::registers::{
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
 };
-use super::uart::{UartChip, send_delay};
+use super::uart::{UartChip, check_pins, select_keys, send_delay};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
@@ -205,11 +205,7 @@ impl Part for Tmc2240UartConfig {
         if self.address > 7 {
             return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 7");
         }
-        for (key, pin) in [("uart_pin", Some(&self.uart_pin)), ("tx_pin", self.tx_pin.as_ref())] {
-            if pin.is_some_and(|pin| pin.inverted) {
-                return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
-            }
-        }
+        check_pins(whose, self.uart_pins())?;
         check_sg_free(whose, self.sg_free)?;
         printer.check_axis(whose, &self.axis)
     }
@@ -229,10 +225,7 @@ impl Part for Tmc2240UartConfig {
         may_be_left_out(cfg);
         cfg.key("uart_pin", &self.uart_pin);
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
-        if !self.select_pins.is_empty() {
-            let pins: Vec<String> = self.select_pins.iter().map(ToString::to_string).collect();
-            cfg.key("select_pins", pins.join(", "));
-        }
+        select_keys(cfg, &self.select_pins);
         cfg.key("uart_address", self.address);
         cfg.key("run_current", 0.8);
         cfg.key("rref", 12000);

@@ -5,8 +5,11 @@
 
 use std::sync::{Arc, Mutex, TryLockError};
 
+use crate::description::check::{Trouble, wrong};
+use crate::description::pin::PinName;
 use crate::engine::serial::SerialChip;
 use crate::engine::wire::{Kind, LevelLine, Wire};
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
 /// The low nibble of a message's first byte. The high nibble may have any value.
@@ -103,6 +106,23 @@ pub(crate) trait UartChip: Send {
         let answer = [SYNC, HOST, register, d3, d2, d1, d0];
         let [a, b, c, d, e, f, g] = answer;
         Some([a, b, c, d, e, f, g, crc8(&answer)])
+    }
+}
+
+/// Refuses UART pins with a `!`.
+pub(crate) fn check_pins<'a>(
+    whose: &str,
+    pins: impl IntoIterator<Item = (&'static str, Option<&'a PinName>)>,
+) -> Result<(), Trouble> {
+    let inverted = pins.into_iter().find(|(_, pin)| pin.is_some_and(|pin| pin.inverted));
+    inverted.map_or(Ok(()), |(key, _)| wrong(whose, key, "klippy inverts no UART", "remove the `!`"))
+}
+
+/// The keys for the lines of a multiplexer.
+pub(crate) fn select_keys(cfg: &mut Sections, select_pins: &[PinName]) {
+    if !select_pins.is_empty() {
+        let pins: Vec<String> = select_pins.iter().map(ToString::to_string).collect();
+        cfg.key("select_pins", pins.join(", "));
     }
 }
 
