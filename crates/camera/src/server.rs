@@ -77,11 +77,7 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Limits {
-        Limits {
-            request: Duration::from_secs(5),
-            answer: Duration::from_secs(5),
-            farewell: Duration::from_millis(500),
-        }
+        Limits { request: Duration::from_secs(5), answer: Duration::from_secs(5), farewell: Duration::from_millis(500) }
     }
 }
 
