@@ -16,6 +16,7 @@ mod kiauh;
 mod life;
 mod links;
 mod one_order;
+mod other_users;
 mod own_printer;
 mod preinst;
 mod process;
