@@ -48,7 +48,7 @@ use simulator::take_over;
 #[cfg(fuzzing)]
 pub mod fuzz {
     pub use super::config::config;
-    pub use super::doctor::printer_cfg;
+    pub use super::computer::printer::printer_cfg;
     pub use super::status::status;
 }
 

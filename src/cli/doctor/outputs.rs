@@ -4,9 +4,8 @@
 use std::path::Path;
 
 use crate::cli::computer::Computer;
+use crate::cli::computer::board::append;
 use crate::cli::finding::Finding;
-
-use super::devices::pi_config;
 
 /// The parameter of a Raspberry Pi's pin drivers. It is "Y" by default in the Raspberry Pi's own kernel, and missing in
 /// older ones.
@@ -31,14 +30,14 @@ fn released_by(computer: &Computer, parameter: &Path) -> Option<Finding> {
         let found = "the kernel makes an output an input when nobody holds it any more: its resistor decides the level";
         return Some(Finding::ok(CHECK, found));
     }
-    let config = pi_config(computer).unwrap_or("config.txt");
     Some(Finding::warning(
         CHECK,
         format!(
             "a heater stays on if Pinion and its guardian die together: the kernel keeps the levels of outputs ({module}.persist_gpio_outputs)"
         ),
         format!(
-            "a resistor that keeps each heater's gate off, and printf '[all]\\ndtparam=strict_gpiod\\n' | sudo tee -a {config}, and reboot; outputs then also fall at each restart: docs/guide/safety.md"
+            "a resistor that keeps each heater's gate off, and {}, and reboot; outputs then also fall at each restart: /usr/share/doc/pinion-mcu/guide/safety.md",
+            append(computer, "dtparam=strict_gpiod")
         ),
     ))
 }
