@@ -30,3 +30,4 @@ mod terminal;
 mod toolpath;
 mod trace;
 mod troubleshooting;
+mod uses;

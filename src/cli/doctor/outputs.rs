@@ -61,7 +61,9 @@ mod tests {
         parameter("pinctrl_bcm2835", "Y");
         tree.put("boot/firmware/config.txt", "");
         let remedy = says(&released(&tree.computer()), CHECK, Warning, "(pinctrl_bcm2835.persist_gpio_outputs)");
-        assert!(remedy.contains("dtparam=strict_gpiod\\n' | sudo tee -a /boot/firmware/config.txt"), "{remedy}");
+        let config = tree.computer().path("/boot/firmware/config.txt");
+        let command = format!("\\n[all]\\ndtparam=strict_gpiod\\n' | sudo tee -a {}, and", config.display());
+        assert!(remedy.contains(&command), "{remedy}");
         assert!(remedy.contains("gate") && remedy.contains("at each restart"), "{remedy}");
         // A Raspberry Pi 5 has both drivers, and pins of one. strict_gpiod is for that one.
         tree.put("sys/bus/platform/drivers/pinctrl-bcm2835/bind", "");
