@@ -77,10 +77,17 @@ pub(super) fn own_lines(text: &str) -> Vec<Own> {
     let lines: Vec<&str> = text.lines().map(str::trim_end).collect();
     let own = lines.windows(3).enumerate().filter_map(|(at, three)| {
         let device = three[0].strip_prefix("# ")?.strip_prefix(MARK)?.trim();
-        let is_line = three[1] == "[all]" && !three[2].starts_with(['#', '[']) && three[2].contains('=');
+        let is_line = three[1] == "[all]" && !three[2].contains(['#', '[']) && three[2].contains('=');
         is_line.then(|| Own { at, device: device.to_owned(), line: three[2].to_owned() })
     });
     own.collect()
+}
+
+/// Whether a config.txt still has lines of a device that somebody has changed.
+pub(super) fn has_changed_lines(text: &str, device: &str) -> bool {
+    let mark = format!("# {MARK} {device}");
+    let own = own_lines(text);
+    text.lines().filter(|line| line.trim_end() == mark).count() > own.iter().filter(|own| own.device == device).count()
 }
 
 /// The text without one of our lines.

@@ -336,25 +336,26 @@ impl Target {
             Some((_, None)) => left.push(format!("{} is not a file of pinion add, and stays", file.display())),
             None => {}
         }
-        if edits.is_empty() {
-            return Ok(edits);
-        }
         let mut stays: Vec<&Section> = self.others(&file).collect();
         // Another accelerometer goes on measuring resonances.
         let resonances = self.file(RESONANCES);
+        let shared = [self.file(MCU), resonances.clone(), file.clone()];
+        let others = side.computer.matching(self.folder().join("*.cfg"));
+        let others: Vec<PathBuf> = others.iter().map(|path| side.computer.name(path)).filter(|path| !shared.contains(path)).collect();
         if let Some(text) = side.read(&resonances)?.filter(|text| is_ours(text) == Some(true)) {
-            let is_its = self.config().section(RESONANCES).is_none_or(|section| section.text("accel_chip") == Some(&device.section(name)));
+            let chip = self.config().section(RESONANCES).and_then(|section| section.text("accel_chip"));
             let is_other = |section: &&&Section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section));
             match stays.iter().find(is_other) {
-                Some(other) if is_its => {
-                    let new = Some(self.resonances(&other.name));
-                    edits.push(Edit { file: resonances.clone(), old: Some(text), new });
+                // It is this other one's already.
+                Some(_) if chip.is_some_and(|chip| chip != device.section(name)) => {}
+                Some(other) => {
+                    let new = Some(self.resonances(&other.name)).filter(|new| *new != text);
+                    edits.extend(new.map(|new| Edit { file: resonances.clone(), old: Some(text), new: Some(new) }));
                 }
-                None if is_its || !stays.iter().any(|section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section))) => {
+                None => {
                     edits.push(gone(&resonances, &text));
                     stays.retain(|section| !self.is_in(section, &resonances));
                 }
-                _ => {}
             }
         }
         let mcu_file = self.file(MCU);
@@ -374,12 +375,14 @@ impl Target {
                         left.push(format!("{} stays: [{}] uses [mcu {mcu}]", mcu_file.display(), user.name));
                     }
                 }
-                None => edits.push(gone(&mcu_file, &text)),
+                // Without its include, klippy does not read the others now.
+                None if own.is_some() || others.is_empty() => edits.push(gone(&mcu_file, &text)),
+                None => {}
             }
         }
         let goes = |file: &Path| edits.iter().any(|edit| edit.file == file && edit.new.is_none());
-        let others = side.computer.matching(self.folder().join("*.cfg"));
-        let mut others = others.iter().map(|path| side.computer.name(path)).filter(|path| !goes(path));
+        let remaining = side.computer.matching(self.folder().join("*.cfg"));
+        let mut remaining = remaining.iter().map(|path| side.computer.name(path)).filter(|path| !goes(path));
         // What klippy would still find of the device would be a section without its options.
         let saved: Vec<&str> = self.config().sections().iter().filter(|section| self.is_in(section, &file)).map(|section| section.name.as_str()).collect();
         let mut printer_cfg = self.config().without_saved(&self.text, &saved);
@@ -388,7 +391,7 @@ impl Target {
         }
         if self.text.contains(INCLUDE) || self.text.contains("[include pinion/") {
             let is_include = |line: &&str| line.trim_end() == INCLUDE;
-            match others.next() {
+            match remaining.next() {
                 Some(other) => {
                     if side.read(&other)?.is_none_or(|text| is_ours(&text).is_none()) {
                         left.push(format!("{} keeps its include: {} is there", self.file.display(), other.display()));
@@ -397,11 +400,13 @@ impl Target {
                 None if self.text.lines().any(|line| is_include(&line)) => {
                     printer_cfg = printer_cfg.split_inclusive('\n').filter(|line| !is_include(line)).collect();
                 }
+                None if edits.is_empty() => {}
                 None => left.push(format!("{} keeps its include: pinion add has not written this line", self.file.display())),
             }
         }
-        if printer_cfg != self.text {
-            edits.push(Edit { file: self.file.clone(), old: Some(self.text.clone()), new: Some(printer_cfg) });
+        match printer_cfg == self.text {
+            true => edits.extend(side.needless_copy(&self.file, &self.text)?),
+            false => edits.push(Edit { file: self.file.clone(), old: Some(self.text.clone()), new: Some(printer_cfg) }),
         }
         Ok(edits)
     }

@@ -220,6 +220,13 @@ impl<'a> Side<'a> {
         }
     }
 
+    /// The change that removes the copy of a file that has no line of ours any more, and is as it was.
+    pub(super) fn needless_copy(&self, file: &Path, text: &str) -> Result<Option<Edit>, String> {
+        let copy = copy_of(file);
+        let saved = if text.contains(MARK) { None } else { self.read(&copy)? };
+        Ok(saved.filter(|saved| saved == text).map(|saved| Edit { file: copy, old: Some(saved), new: None }))
+    }
+
     /// Locks of all folders with changes.
     fn locked(&self, edits: &[Edit]) -> Result<Vec<Flock<File>>, String> {
         let folders: BTreeSet<&Path> = edits.iter().filter_map(|edit| edit.file.parent()).collect();

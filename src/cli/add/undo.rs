@@ -123,6 +123,9 @@ impl Needs<'_> {
             };
             match board.boot {
                 Boot::ConfigTxt => {
+                    if boot::has_changed_lines(&old, &own) {
+                        left.push(format!("{} keeps lines below \"# pinion add {own}\": they were changed since", file.display()));
+                    }
                     for line in boot::own_lines(&old).into_iter().rev().filter(|line| line.device == own) {
                         match self.user(board, &line.line) {
                             None => new = boot::without(&new, &line),
@@ -152,7 +155,9 @@ impl Needs<'_> {
                     }
                 }
             }
-            if new != old {
+            if new == old {
+                edits.extend(side.needless_copy(file, &old)?);
+            } else {
                 edits.push(Edit { file: file.to_owned(), old: Some(old), new: Some(new) });
             }
         }

@@ -48,9 +48,15 @@ pub(super) fn conflicts(uses: &Uses) -> Vec<Finding> {
             );
             let select = one.function.is_none().then_some(other.function.as_deref()).flatten();
             let remedy = match select.and_then(|function| function.strip_prefix("spi")) {
-                Some(bus) => format!(
-                    "if that pin is the chip select: cs_pin: MCU:None and spi_bus: spidev{bus}.0 in printer.cfg; otherwise another pin (pinion pins --used)"
-                ),
+                Some(bus) => {
+                    let mcu = match &one.source {
+                        Source::Printer(path) => uses.mcus.get(path).map_or("", String::as_str),
+                        _ => "",
+                    };
+                    format!(
+                        "if that pin is the chip select: cs_pin: {mcu}:None and spi_bus: spidev{bus}.0 in printer.cfg; otherwise another pin (pinion pins --used)"
+                    )
+                }
                 None => "another pin for one of them: pinion pins --used shows which are used".into(),
             };
             findings.push(Finding::error(CHECK, found, remedy));

@@ -105,6 +105,8 @@ pub(in crate::cli) struct Uses {
     /// The overlays of config.txt.
     pub(in crate::cli) loaded: Vec<boot::Loaded>,
     pub(in crate::cli) no_lines: Vec<NoLine>,
+    /// The name of this computer's MCU in each configuration.
+    pub(in crate::cli) mcus: BTreeMap<PathBuf, String>,
 }
 
 impl Uses {
@@ -116,7 +118,7 @@ impl Uses {
         inventory: Option<&Inventory>,
     ) -> Uses {
         let names = Names::of(computer, board, inventory);
-        let mut uses = Uses { names, board: board.cloned(), all: Vec::new(), loaded: Vec::new(), no_lines: Vec::new() };
+        let mut uses = Uses { names, board: board.cloned(), all: Vec::new(), loaded: Vec::new(), no_lines: Vec::new(), mcus: BTreeMap::new() };
         if let Some(board) = board {
             uses.add_boot(computer, board);
         }
@@ -142,6 +144,7 @@ impl Uses {
     fn add_printer(&mut self, computer: &Computer, path: &Path, printer: &Printer) {
         let own = printer.own_mcus(computer);
         let source = Source::Printer(path.to_owned());
+        self.mcus.extend(own.keys().next().map(|name| (path.to_owned(), name.clone())));
         for section in printer.config.sections() {
             let user = format!("[{}]", section.name);
             let pins: Vec<_> = printer.pins_of(section).filter(|named| own.contains_key(&named.pin.chip)).collect();
