@@ -47,6 +47,9 @@ pub(super) struct Device {
     section: String,
     /// The usual name behind that. A device without one gets a name only if the user gives it one.
     called: Option<String>,
+    /// Whether klippy wants a section without a name before one with a name.
+    #[serde(default)]
+    pub(super) wants_first: bool,
     /// klippy's module, if it is not called like the section.
     module: Option<String>,
     /// Other names that people look for.

@@ -144,6 +144,12 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
     {
         return Err("--name: a name has letters, digits and _".into());
     }
+    if args.name.is_some()
+        && device.wants_first
+        && target.as_ref().is_ok_and(|target| target.config().section(&device.section(None)).is_none())
+    {
+        return Err(format!("--name: the first one has no name: pinion add {}", device.name));
+    }
     if args.config.is_some()
         && let Err(why) = &target
     {
