@@ -184,7 +184,11 @@ fn link(symlink: &Path) -> Finding {
     }
     if !is_host_path(symlink) && !is_linked(symlink) {
         let found = format!("{path}: klippy takes it for a serial port, because it does not begin with {HOST_PATHS}");
-        return Finding::warning("symlink", found, format!("-I {HOST_PATHS}NAME, or a link of that name that leads to it"));
+        return Finding::warning(
+            "symlink",
+            found,
+            format!("-I {HOST_PATHS}NAME, or a link of that name that leads to it"),
+        );
     }
     match fs::symlink_metadata(symlink) {
         Ok(_) if leads_to_ours(symlink) => {

@@ -156,7 +156,10 @@ fn klippy_accepts_what_each_device_writes() {
             let name = entry.unwrap().file_name().into_string().unwrap();
             put(&format!("klipper/klippy/extras/{}", if name.contains('.') { name } else { format!("{name}/x") }), "");
         }
-        put("lib/systemd/system/klipper.service", "[Service]\nExecStart=/usr/bin/python3 /klipper/klippy/klippy.py /config/printer.cfg\n");
+        put(
+            "lib/systemd/system/klipper.service",
+            "[Service]\nExecStart=/usr/bin/python3 /klipper/klippy/klippy.py /config/printer.cfg\n",
+        );
     };
     start();
     let list: Value = serde_json::from_slice(&pinion(&["--json"]).stdout).unwrap();
@@ -165,7 +168,8 @@ fn klippy_accepts_what_each_device_writes() {
     assert!(devices.len() >= 20, "{devices:?}");
     let is_kalico = checkout.join("klippy/extras/danger_options.py").exists();
     let dialect = if is_kalico { "kalico" } else { "master" };
-    let dictionary = Command::new(pinion_path()).args(["dict", "--board", "sim", "--dialect", dialect]).output().unwrap();
+    let dictionary =
+        Command::new(pinion_path()).args(["dict", "--board", "sim", "--dialect", dialect]).output().unwrap();
     let dictionary: Value = serde_json::from_slice(&dictionary.stdout).unwrap();
     for device in devices {
         for more in [&[][..], &["--name", "second"]] {
@@ -180,7 +184,8 @@ fn klippy_accepts_what_each_device_writes() {
             // The simulated printer has other pins than a Raspberry Pi's header.
             let mut known = dictionary.clone();
             let files = fs::read_dir(path("config/pinion")).unwrap().map(|file| file.unwrap().path());
-            let written = files.map(|file| fs::read_to_string(file).unwrap()).chain([before.clone()]).collect::<String>();
+            let written =
+                files.map(|file| fs::read_to_string(file).unwrap()).chain([before.clone()]).collect::<String>();
             for (number, line) in (100_000..).zip(written.lines()) {
                 let Some((key, value)) = line.split_once(": ") else { continue };
                 let name = value.trim_start_matches(['^', '!']).trim_start_matches("mcu:").to_owned();

@@ -248,9 +248,16 @@ fn each_board_gets_its_own_line_and_back() {
         let own = card.read(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"));
         assert!(own.contains(&format!("[adxl345]\ncs_pin: host:None\nspi_bus: {node}\n")), "{own}");
         let tester = card.read(&PRINTER.replace("printer.cfg", "pinion/resonance_tester.cfg"));
-        assert!(tester.ends_with("accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 150, 155, 20\n"), "{tester}");
         assert!(
-            card.read(PRINTER).starts_with("# my printer\n[include mainsail.cfg]\n[include pinion/*.cfg] # by pinion add\n\n[printer]")
+            tester.ends_with(
+                "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 150, 155, 20\n"
+            ),
+            "{tester}"
+        );
+        assert!(
+            card.read(PRINTER).starts_with(
+                "# my printer\n[include mainsail.cfg]\n[include pinion/*.cfg] # by pinion add\n\n[printer]"
+            )
         );
         assert_eq!(card.read(&format!("{PRINTER}.before-pinion")), PRINTER_CFG);
         let once = card.snapshot();
@@ -357,7 +364,10 @@ fn a_picture_of_the_wires() {
     assert_eq!(document.descendants().filter(|node| node.has_tag_name("path")).count(), 4);
     let shown = card.added(&["relay", "--pin", "40", "--dry-run"]);
     assert!(shown.contains("pin 40") && shown.contains("+ pin: host:GPIO21"), "{shown}");
-    assert!(card.refused(&["relay", "--pin", "1", "--dry-run"]).contains("--pin: this pin has no free line: choose one of 11 (GPIO17), "));
+    assert!(
+        card.refused(&["relay", "--pin", "1", "--dry-run"])
+            .contains("--pin: this pin has no free line: choose one of 11 (GPIO17), ")
+    );
     assert!(card.refused(&["relay", "--bus", "spi"]).contains("--bus: relay is connected by GPIO lines"));
     assert!(card.refused(&["adxl354"]).contains("did you mean adxl345?"));
 }
@@ -377,9 +387,7 @@ fn the_user_of_an_unknown_board_reads_what_to_look_up() {
     assert!(card.refused(&["adxl345", "--yes"]).contains("this image has no overlay for spidev1.1"));
     assert!(card.refused(&["bme280", "--yes"]).contains("Pinion knows no I2C on the header of a BigTreeTech CB1"));
     let card = Card::of("Raspberry Pi 4 Model B", &[]);
-    assert!(
-        card.refused(&["adxl345", "--yes"]).contains("there is no /boot/firmware/config.txt nor /boot/config.txt")
-    );
+    assert!(card.refused(&["adxl345", "--yes"]).contains("there is no /boot/firmware/config.txt nor /boot/config.txt"));
 }
 
 #[test]
@@ -428,9 +436,7 @@ fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
         let about = fs::symlink_metadata(card.path(path)).unwrap();
         (about.uid(), about.gid())
     };
-    for name in
-        ["printer.cfg", "printer.cfg.before-pinion", "pinion", "pinion/adxl345.cfg", "pinion/host-mcu.cfg"]
-    {
+    for name in ["printer.cfg", "printer.cfg.before-pinion", "pinion", "pinion/adxl345.cfg", "pinion/host-mcu.cfg"] {
         assert_eq!(owner(&format!("{config}/{name}")), (nobody, nobody), "{name}");
     }
     assert_eq!(owner("boot/firmware/config.txt"), (0, 0));
@@ -477,7 +483,10 @@ fn the_wires_are_those_of_the_board_s_settings() {
 fn ends_of_lines_stay_as_they_are() {
     for config_txt in ["dtparam=audio=on", "dtparam=audio=on\r\n[pi4]\r\nx=y", "dtparam=audio=on\r\n", "", "\n\n"] {
         for printer_cfg in [PRINTER_CFG.replace('\n', "\r\n"), PRINTER_CFG.trim_end().to_owned(), String::new()] {
-            let card = Card::of("Raspberry Pi 4 Model B", &[("boot/firmware/config.txt", config_txt), (PRINTER, &printer_cfg)]);
+            let card = Card::of(
+                "Raspberry Pi 4 Model B",
+                &[("boot/firmware/config.txt", config_txt), (PRINTER, &printer_cfg)],
+            );
             let before = card.snapshot();
             card.added(&["adxl345", "--yes"]);
             for (path, old) in [("boot/firmware/config.txt", config_txt), (PRINTER, &*printer_cfg)] {
@@ -570,7 +579,10 @@ fn a_printer_cfg_that_may_not_be_changed_stays() {
     fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o444)).unwrap();
     let log = card.refused(&["relay", "--yes"]);
     let file = card.path(PRINTER);
-    assert!(log.contains(&format!("/{PRINTER} is read-only: chmod u+w {}, then call this again", file.display())), "{log}");
+    assert!(
+        log.contains(&format!("/{PRINTER} is read-only: chmod u+w {}, then call this again", file.display())),
+        "{log}"
+    );
     assert_eq!(card.read(PRINTER), PRINTER_CFG);
     assert!(!card.path(&PRINTER.replace("printer.cfg", "pinion")).exists());
     fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o644)).unwrap();
@@ -737,7 +749,8 @@ fn a_host_that_does_not_start_is_no_success() {
     let (address, server) = moonraker("error");
     let log = card.refused(&["relay", "--yes", "--moonraker", &address]);
     assert!(
-        log.contains("klippy says: mcu 'host': Unable to connect: sudo pinion add relay --moonraker ") && log.contains(" --undo takes it back"),
+        log.contains("klippy says: mcu 'host': Unable to connect: sudo pinion add relay --moonraker ")
+            && log.contains(" --undo takes it back"),
         "{log}"
     );
     card.added(&["relay", "--yes", "--undo", "--moonraker", &address]);
@@ -759,7 +772,10 @@ fn a_file_that_is_the_user_s_stays() {
     assert!(printed.contains("Nothing is left to change."), "{printed}");
     assert_eq!(card.snapshot(), before);
     let printed = card.added(&["adxl345", "--yes"]);
-    assert!(printed.contains(&format!("[adxl345] is in printer.cfg already (/{PRINTER}:16), and stays as it is.")), "{printed}");
+    assert!(
+        printed.contains(&format!("[adxl345] is in printer.cfg already (/{PRINTER}:16), and stays as it is.")),
+        "{printed}"
+    );
     assert!(!Path::new(&card.path(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"))).exists());
     let printed = card.added(&["light", "--yes"]);
     assert!(printed.contains("+ pin: rpi:GPIO17"), "the MCU's own name: {printed}");

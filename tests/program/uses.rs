@@ -76,7 +76,11 @@ fn a_line_that_something_uses_is_avoided_named_and_shown() {
             symlink("/lib/systemd/system/pinion-mcu@.service", card.path(enabled)).unwrap();
             card
         }),
-        ("[output_pin mine]", Card::pi().with_printer("[board_pins x]\nmcu: host\naliases: LAMP=GPIO17\n[output_pin mine]\npin: host:LAMP\n")),
+        (
+            "[output_pin mine]",
+            Card::pi()
+                .with_printer("[board_pins x]\nmcu: host\naliases: LAMP=GPIO17\n[output_pin mine]\npin: host:LAMP\n"),
+        ),
     ];
     let own = format!("/{PRINTER}");
     for (user, card) in cards {
@@ -97,7 +101,10 @@ fn a_line_that_something_uses_is_avoided_named_and_shown() {
             let text = card.read(PRINTER);
             card.put(PRINTER, &format!("{text}[output_pin clash]\npin: host:gpio17\n"));
             let told = card.doctor();
-            let line = told.lines().find(|line| line.contains("GPIO17 (pin 11) is used twice")).unwrap_or_else(|| panic!("{user}: {told}"));
+            let line = told
+                .lines()
+                .find(|line| line.contains("GPIO17 (pin 11) is used twice"))
+                .unwrap_or_else(|| panic!("{user}: {told}"));
             assert!(line.contains("[output_pin clash]") && line.contains(user), "{line}");
         }
     }
@@ -111,7 +118,9 @@ fn a_bus_that_something_uses_is_avoided() {
     assert!(card.planned(&["adxl345"]).contains("spi_bus: spidev0.1\n"));
     // A display with a touch screen.
     let card = Card::pi().with_config_txt("dtparam=spi=on\ndtoverlay=tft35a:rotate=90\n");
-    assert!(card.refused(&["adxl345", "--dry-run"]).contains("is used by overlay tft35a (/boot/firmware/config.txt:53)"));
+    assert!(
+        card.refused(&["adxl345", "--dry-run"]).contains("is used by overlay tft35a (/boot/firmware/config.txt:53)")
+    );
     // Its lines are no place for LEDs or switches.
     assert!(card.planned(&["relay"]).contains("pin: host:GPIO27\n"), "GPIO17 is the touch screen's");
     let card = Card::pi().with_config_txt("dtoverlay=gpio-fan,gpiopin=18\n");
@@ -125,7 +134,10 @@ fn a_bus_that_something_uses_is_avoided() {
     assert!(card.planned(&["mpu9250"]).contains("i2c_address: 105\n"));
     // The chip selects of a CB1's controller are held by the kernel.
     let env = "overlay_prefix=sun50i-h616\n";
-    let card = Card::of("BigTreeTech CB1", &[("boot/BoardEnv.txt", env), ("boot/dtb/allwinner/overlay/sun50i-h616-spidev1_1.dtbo", "")]);
+    let card = Card::of(
+        "BigTreeTech CB1",
+        &[("boot/BoardEnv.txt", env), ("boot/dtb/allwinner/overlay/sun50i-h616-spidev1_1.dtbo", "")],
+    );
     card.added(&["adxl345", "--yes"]);
     for (device, line) in [("relay", "gpio78"), ("light", "gpio76"), ("button", "gpio74"), ("filament", "gpio73")] {
         assert!(card.added(&[device, "--yes"]).contains(&format!("host:300b000.pinctrl/{line}\n")), "{device}");
@@ -133,7 +145,10 @@ fn a_bus_that_something_uses_is_avoided() {
     // An overlay that nobody knows.
     let card = Card::pi().with_config_txt("dtoverlay=somebodys-hat\n");
     let told = card.added(&["relay", "--dry-run"]);
-    assert!(told.contains("/boot/firmware/config.txt:52 loads the overlay somebodys-hat. Pinion does not know which pins"), "{told}");
+    assert!(
+        told.contains("/boot/firmware/config.txt:52 loads the overlay somebodys-hat. Pinion does not know which pins"),
+        "{told}"
+    );
 }
 
 /// The line that was moved for 1-Wire is not given to a relay, and the thermometer can be added again.
@@ -155,7 +170,10 @@ fn what_a_section_of_the_user_needs_stays_at_an_undo() {
     card.put(PRINTER, &format!("{text}\n[output_pin mine]\npin: !host:GPIO5\n"));
     let told = card.added(&["relay", "--undo", "--yes"]);
     assert!(told.contains("pinion/host-mcu.cfg stays: [output_pin mine] uses [mcu host]"), "{told}");
-    assert!(card.path(&card.beside("pinion/host-mcu.cfg")).exists() && card.read(PRINTER).contains("[include pinion/*.cfg]"));
+    assert!(
+        card.path(&card.beside("pinion/host-mcu.cfg")).exists()
+            && card.read(PRINTER).contains("[include pinion/*.cfg]")
+    );
     // A file of the user's own is read by the same include.
     let card = Card::pi();
     card.added(&["relay", "--yes"]);
@@ -188,10 +206,16 @@ fn a_command_that_is_printed_is_whole() {
     let told = card.added(&["lis2dw", "--bus", "i2c", "--name", "bed", "--config", &config, "--yes"]);
     let last = told.lines().last().unwrap();
     let root = card.root();
-    assert_eq!(last, format!("sudo pinion add lis2dw --name bed --config {config} --root {root} --undo takes all of it back."));
+    assert_eq!(
+        last,
+        format!("sudo pinion add lis2dw --name bed --config {config} --root {root} --undo takes all of it back.")
+    );
     let (address, server) = moonraker("error");
     let log = card.refused(&["relay", "--pin", "16", "--moonraker", &address, "--yes"]);
-    assert!(log.contains(&format!("sudo pinion add relay --moonraker {address} --root {root} --undo takes it back")), "{log}");
+    assert!(
+        log.contains(&format!("sudo pinion add relay --moonraker {address} --root {root} --undo takes it back")),
+        "{log}"
+    );
     end(&address, server);
     let log = card.refused(&["light", "--pin", "GPIO24"]);
     assert!(log.contains("call it with --yes"), "{log}");
@@ -206,7 +230,10 @@ fn the_mcu_of_another_computer_or_board_is_left_alone() {
     assert!(card.planned(&["adxl345"]).contains("[mcu host]\n"));
     let card = Card::pi().with_printer("[mcu host]\nserial: /dev/serial/by-id/usb-pico\n");
     let planned = card.planned(&["relay"]);
-    assert!(planned.contains("[mcu host2]\nserial: /tmp/klipper_host_mcu\n") && planned.contains("pin: host2:GPIO17\n"), "{planned}");
+    assert!(
+        planned.contains("[mcu host2]\nserial: /tmp/klipper_host_mcu\n") && planned.contains("pin: host2:GPIO17\n"),
+        "{planned}"
+    );
 }
 
 /// SAVE_CONFIG has written a section of the device.
@@ -217,11 +244,17 @@ fn an_undo_takes_the_saved_lines_of_the_device_out() {
     let text = card.read(PRINTER);
     let head = "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.\n#*#\n";
     let text = text.split("#*#").next().unwrap().to_owned();
-    card.put(PRINTER, &format!("{text}\n{head}#*# [load_cell]\n#*# counts_per_gram = 73.2\n#*#\n#*# [probe]\n#*# z_offset = 1\n"));
+    card.put(
+        PRINTER,
+        &format!("{text}\n{head}#*# [load_cell]\n#*# counts_per_gram = 73.2\n#*#\n#*# [probe]\n#*# z_offset = 1\n"),
+    );
     let told = card.added(&["hx711", "--undo", "--yes"]);
     assert!(told.contains("the lines of [load_cell] in the SAVE_CONFIG block of"), "{told}");
     let left = card.read(PRINTER);
-    assert!(!left.contains("load_cell") && left.contains(&format!("\n{head}#*# [probe]\n#*# z_offset = 1\n")), "{left}");
+    assert!(
+        !left.contains("load_cell") && left.contains(&format!("\n{head}#*# [probe]\n#*# z_offset = 1\n")),
+        "{left}"
+    );
 }
 
 /// A command of the doctor that is pasted into a shell.
@@ -230,7 +263,8 @@ fn the_doctor_s_command_keeps_the_last_line_and_the_card() {
     let card = Card::pi();
     card.put("boot/firmware/config.txt", "dtoverlay=vc4-kms-v3d");
     let told = card.doctor();
-    let command = told.lines().find_map(|line| line.split_once("if it is wanted: ")?.1.split_once(", and reboot")).unwrap().0;
+    let command =
+        told.lines().find_map(|line| line.split_once("if it is wanted: ")?.1.split_once(", and reboot")).unwrap().0;
     assert!(command.contains("dtoverlay=pwm-2chan"), "{command}");
     let pasted = Command::new("sh").args(["-c", &command.replace("sudo ", "")]).output().unwrap();
     assert!(pasted.status.success(), "{pasted:?}");
@@ -239,25 +273,39 @@ fn the_doctor_s_command_keeps_the_last_line_and_the_card() {
 
 #[test]
 fn the_doctor_names_pins_that_are_not_there_and_the_right_one() {
-    let card = Card::of("BigTreeTech CB1", &[]).with_printer(&format!("{HOST}[output_pin a]\npin: host:PG19\n[output_pin b]\npin: host:gpio500\n"));
+    let card = Card::of("BigTreeTech CB1", &[])
+        .with_printer(&format!("{HOST}[output_pin a]\npin: host:PG19\n[output_pin b]\npin: host:gpio500\n"));
     let told = card.doctor();
-    assert!(told.contains("[output_pin a] (/home/pi/printer_data/config/printer.cfg:16) names the pin host:PG19"), "{told}");
+    assert!(
+        told.contains("[output_pin a] (/home/pi/printer_data/config/printer.cfg:16) names the pin host:PG19"),
+        "{told}"
+    );
     assert!(told.contains("-> write host:300b000.pinctrl/gpio211\n"), "{told}");
     assert!(told.contains("names the pin host:gpio500, which this computer does not have"), "{told}");
     // sysfs counts the lines from 512 on.
     let card = Card::pi().with_printer(&format!("{HOST}[output_pin a]\npin: !host:gpio529\n"));
     assert!(card.doctor().contains("-> write !host:GPIO17\n"), "{}", card.doctor());
     // The chip select of a bus.
-    let card = Card::pi().with_printer(&format!("{HOST}[adxl345]\ncs_pin: host:GPIO8\nspi_bus: spidev0.0\n")).with_config_txt("dtparam=spi=on\n");
+    let card = Card::pi()
+        .with_printer(&format!("{HOST}[adxl345]\ncs_pin: host:GPIO8\nspi_bus: spidev0.0\n"))
+        .with_config_txt("dtparam=spi=on\n");
     let told = card.doctor();
-    assert!(told.contains("GPIO8 (pin 24) is used twice: by [adxl345]") && told.contains("cs_pin: host:None and spi_bus: spidev0.0"), "{told}");
+    assert!(
+        told.contains("GPIO8 (pin 24) is used twice: by [adxl345]")
+            && told.contains("cs_pin: host:None and spi_bus: spidev0.0"),
+        "{told}"
+    );
 }
 
 #[test]
 fn the_doctor_compares_klippy_s_python_and_the_clock_of_i2c() {
-    let card = Card::pi().with_printer(&format!("{HOST}[mpu9250]\ni2c_mcu: host\ni2c_bus: i2c.1\n[resonance_tester]\naccel_chip: mpu9250\n"));
+    let card = Card::pi().with_printer(&format!(
+        "{HOST}[mpu9250]\ni2c_mcu: host\ni2c_bus: i2c.1\n[resonance_tester]\naccel_chip: mpu9250\n"
+    ));
     card.put("etc/passwd", "pi:x:54321:54321::/home/pi:/bin/sh\n");
-    let unit = format!("[Service]\nUser=pi\nExecStart=/home/pi/klippy-env/bin/python /home/pi/klipper/klippy/klippy.py /{PRINTER}\n");
+    let unit = format!(
+        "[Service]\nUser=pi\nExecStart=/home/pi/klippy-env/bin/python /home/pi/klipper/klippy/klippy.py /{PRINTER}\n"
+    );
     card.put("etc/systemd/system/klipper.service", &unit);
     card.put("home/pi/klippy-env/bin/python", "");
     card.put("home/pi/klippy-env/pyvenv.cfg", "include-system-site-packages = false\n");
@@ -311,7 +359,9 @@ fn an_absolute_link_of_a_card_leads_to_the_card() {
 fn a_device_that_is_there_under_another_name_is_not_added_again() {
     let sections = "[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.0\n[temperature_sensor room]\nsensor_type: BME280\ni2c_mcu: host\ni2c_bus: i2c.1\ni2c_address: 118\n";
     let card = Card::pi().with_printer(&format!("{HOST}{sections}"));
-    for (device, section, line) in [("lis2dw", "lis2dw bed", "dtparam=spi=on"), ("bme280", "temperature_sensor room", "dtparam=i2c_arm=on")] {
+    for (device, section, line) in
+        [("lis2dw", "lis2dw bed", "dtparam=spi=on"), ("bme280", "temperature_sensor room", "dtparam=i2c_arm=on")]
+    {
         let told = card.added(&[device, "--yes"]);
         assert!(told.contains(&format!("[{section}] is in printer.cfg already")), "{told}");
         assert!(card.read("boot/firmware/config.txt").contains(&format!("\n{line}\n")));
@@ -336,7 +386,10 @@ fn a_second_device_has_a_name() {
     let before = card.snapshot();
     card.added(&["relay", "--yes"]);
     let told = card.added(&["relay", "--name", "lamp", "--yes"]);
-    assert!(told.contains("+ [output_pin lamp]\n+ pin: host:GPIO27\n") && told.contains("SET_PIN PIN=lamp VALUE=1"), "{told}");
+    assert!(
+        told.contains("+ [output_pin lamp]\n+ pin: host:GPIO27\n") && told.contains("SET_PIN PIN=lamp VALUE=1"),
+        "{told}"
+    );
     card.added(&["relay", "--undo", "--yes"]);
     assert!(card.path(&card.beside("pinion/relay-lamp.cfg")).exists());
     card.added(&["relay", "--name", "lamp", "--undo", "--yes"]);
@@ -349,7 +402,9 @@ fn a_repeated_call_draws_what_was_written() {
     card.added(&["relay", "--pin", "16", "--yes"]);
     let told = card.added(&["relay", "--yes"]);
     assert!(told.contains("pin 16  GPIO23") && told.contains("Nothing is left to change."), "{told}");
-    assert!(card.refused(&["relay", "--pin", "18", "--yes"]).contains("relay is on GPIO23 (pin 16) already: take it back"));
+    assert!(
+        card.refused(&["relay", "--pin", "18", "--yes"]).contains("relay is on GPIO23 (pin 16) already: take it back")
+    );
     card.added(&["lis2dw", "--bus", "i2c", "--yes"]);
     let told = card.added(&["lis2dw", "--yes"]);
     assert!(told.contains("by I2C\n") && told.contains("Nothing is left to change."), "{told}");
@@ -373,7 +428,11 @@ fn an_undo_leaves_what_was_changed_and_says_so() {
     assert!(shown.contains("removed file") && shown.contains("Nothing was changed (--dry-run)."), "{shown}");
     assert!(card.path(&own).exists());
     let told = card.added(&["adxl345", "--undo", "--yes"]);
-    assert!(told.contains("printer.cfg keeps its include: pinion add has not written this line") || told.contains("keeps its include"), "{told}");
+    assert!(
+        told.contains("printer.cfg keeps its include: pinion add has not written this line")
+            || told.contains("keeps its include"),
+        "{told}"
+    );
     assert!(told.contains("config.txt keeps lines below \"# pinion add adxl345\": they were changed since"), "{told}");
     assert_eq!(card.read("boot/firmware/config.txt"), config);
     assert_eq!(card.read(PRINTER), text);
@@ -440,15 +499,22 @@ fn a_config_txt_that_is_not_utf_8_keeps_its_bytes() {
 #[test]
 fn a_device_that_the_host_does_not_have_is_not_offered() {
     let card = Card::pi();
-    card.put("etc/systemd/system/klipper.service", &format!("[Service]\nExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /{PRINTER}\n"));
+    card.put(
+        "etc/systemd/system/klipper.service",
+        &format!("[Service]\nExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /{PRINTER}\n"),
+    );
     for module in ["bus", "adxl345", "output_pin"] {
         card.put(&format!("home/pi/klipper/klippy/extras/{module}.py"), "");
     }
     let log = card.refused(&["ads1115", "--yes"]);
     assert!(log.contains("the host in /home/pi/klipper/klippy has no module ads1x1x"), "{log}");
     let list = card.added(&[]);
-    let row = |name: &str| list.lines().find(|line| line.starts_with(&format!("  {name} "))).unwrap_or_default().to_owned();
-    assert!(row("ads1115").ends_with("not in your version of the host") && !row("adxl345").contains("not in"), "{list}");
+    let row =
+        |name: &str| list.lines().find(|line| line.starts_with(&format!("  {name} "))).unwrap_or_default().to_owned();
+    assert!(
+        row("ads1115").ends_with("not in your version of the host") && !row("adxl345").contains("not in"),
+        "{list}"
+    );
     card.added(&["relay", "--yes"]);
 }
 

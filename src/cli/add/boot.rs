@@ -93,10 +93,13 @@ pub(super) fn has_changed_lines(text: &str, device: &str) -> bool {
 /// The text without one of our lines.
 pub(super) fn without(text: &str, own: &Own) -> String {
     let lines: Vec<&str> = text.split_inclusive('\n').collect();
-    let section = |lines: &[&str]| lines.iter().rev().map(|line| line.trim()).find(|line| line.starts_with('[')).map(str::to_owned);
+    let section = |lines: &[&str]| {
+        lines.iter().rev().map(|line| line.trim()).find(|line| line.starts_with('[')).map(str::to_owned)
+    };
     // Lines behind ours may rely on our section.
     let before = section(&lines[..own.at]).is_none_or(|section| section == "[all]");
-    let next = lines[own.at + 3..].iter().map(|line| line.trim()).find(|line| !line.is_empty() && !line.starts_with('#'));
+    let next =
+        lines[own.at + 3..].iter().map(|line| line.trim()).find(|line| !line.is_empty() && !line.starts_with('#'));
     let keeps = !before && next.is_some_and(|next| !next.starts_with('['));
     let is_gone = |at: usize| (own.at..own.at + 3).contains(&at) && !(keeps && at == own.at + 1);
     lines.iter().enumerate().filter(|(at, _)| !is_gone(*at)).map(|(_, line)| *line).collect()
@@ -105,7 +108,8 @@ pub(super) fn without(text: &str, own: &Own) -> String {
 /// The text in which one of our lines is another device's.
 pub(super) fn handed_over(text: &str, own: &Own, device: &str) -> String {
     let end = end_of(text);
-    let line = |(at, line): (usize, &str)| if at == own.at { format!("# {MARK} {device}{end}") } else { line.to_owned() };
+    let line =
+        |(at, line): (usize, &str)| if at == own.at { format!("# {MARK} {device}{end}") } else { line.to_owned() };
     text.split_inclusive('\n').enumerate().map(line).collect()
 }
 
@@ -189,7 +193,8 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
             text = if rest.is_empty() { unset(&text, "overlays") } else { set(&text, "overlays", &rest) };
             continue;
         }
-        let Some(((key, value), was)) = own.rsplit_once(", ").and_then(|(set, was)| Some((set.split_once('=')?, was))) else {
+        let Some(((key, value), was)) = own.rsplit_once(", ").and_then(|(set, was)| Some((set.split_once('=')?, was)))
+        else {
             continue;
         };
         if last(&text, key) != Some(value) {
@@ -310,7 +315,9 @@ mod tests {
         assert_eq!(back(&format!("[cm5]\na=b\n{own}[pi4]\nc=d\n")), "[cm5]\na=b\n[pi4]\nc=d\n");
         assert_eq!(back(&format!("a=b\n{own}c=d\n")), "a=b\nc=d\n");
         // Somebody has changed it, and so it is theirs.
-        for changed in ["# pinion add x\n[all]\n#dtparam=spi=on\n", "# pinion add x\n[pi4]\ndtparam=spi=on\n", "dtparam=spi=on\n"] {
+        for changed in
+            ["# pinion add x\n[all]\n#dtparam=spi=on\n", "# pinion add x\n[pi4]\ndtparam=spi=on\n", "dtparam=spi=on\n"]
+        {
             assert_eq!(own_lines(changed), [], "{changed}");
         }
         assert_eq!(handed_over(own, &own_lines(own)[0], "y"), own.replace('x', "y"));

@@ -197,7 +197,9 @@ impl Device {
     pub(super) fn is_chip_of(&self, section: &Section) -> bool {
         let is_chip = self.way.iter().any(|way| matches!(way.bus, Kind::Spi | Kind::I2c | Kind::W1));
         let is_kind = section.kind() == self.section;
-        is_chip && is_kind && (self.section != "temperature_sensor" || section.text("sensor_type") == self.sensor_type())
+        is_chip
+            && is_kind
+            && (self.section != "temperature_sensor" || section.text("sensor_type") == self.sensor_type())
             && (self.section != "temperature_sensor" || self.sensor_type().is_some())
     }
 }
@@ -421,7 +423,9 @@ mod tests {
         let card = Tree::new();
         let named = board::Board::of(&card.computer(), Some("raspberry-pi-5")).unwrap();
         assert_eq!(named.unwrap().name, "Raspberry Pi 5", "a card has no device tree");
-        assert!(board::Board::of(&card.computer(), Some("pi5")).unwrap_err().contains("choose one of raspberry-pi-3, "));
+        assert!(
+            board::Board::of(&card.computer(), Some("pi5")).unwrap_err().contains("choose one of raspberry-pi-3, ")
+        );
     }
 
     /// On the device trees of boards that people own.
@@ -530,7 +534,12 @@ mod tests {
         assert_eq!(line(&[], Some("gpio21")), Ok(40));
         assert_eq!(line(&[], Some("29")), Ok(29), "it is not among the proposed ones, and it is a line");
         for wrong in ["0", "1", "6", "41", "18446744073709551615", "GPIO99", "x"] {
-            assert!(line(&[], Some(wrong)).unwrap_err().starts_with("--pin: this pin has no free line: choose one of 11 (GPIO17)"), "{wrong}");
+            assert!(
+                line(&[], Some(wrong))
+                    .unwrap_err()
+                    .starts_with("--pin: this pin has no free line: choose one of 11 (GPIO17)"),
+                "{wrong}"
+            );
         }
         assert!(line(&["GPIO21"], Some("40")).is_err());
         assert_eq!(catalog.with_id(0x0f, 0x33).unwrap().name, "lis3dh");

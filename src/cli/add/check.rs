@@ -11,10 +11,10 @@ use crate::cli::computer::board::{Board, Kind, Spot};
 use crate::cli::computer::{Access, Computer};
 use crate::cli::quietly;
 
-use super::{Work, command};
 use super::catalog::Check;
 use super::printer::Target;
 use super::probe::{self, Answer};
+use super::{Work, command};
 
 /// How often a chip's driver is asked for a value.
 const SAMPLES: usize = 8;

@@ -19,7 +19,11 @@ pub(in crate::cli) fn missing(computer: &Computer, configs: &BTreeSet<PathBuf>) 
     let finding = |section: &Section| {
         let file = section.settings().iter().find_map(node).filter(|file| !computer.exists(file))?;
         let found = format!("[{}] in printer.cfg needs {file}, which is not there", section.name);
-        let is_it = |device: &&Device| device.is_chip_of(section) || section.kind() == device.section(None).split(' ').next().unwrap_or_default() && device.name == "ws2812";
+        let is_it = |device: &&Device| {
+            device.is_chip_of(section)
+                || section.kind() == device.section(None).split(' ').next().unwrap_or_default()
+                    && device.name == "ws2812"
+        };
         let remedy = match catalog.devices.iter().find(is_it) {
             Some(device) => format!("sudo pinion add {}{}", device.name, computer.root_option()),
             None => "enable its bus: pinion add lists what it knows".into(),

@@ -164,7 +164,11 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
     let board = board.ok_or_else(|| list::unknown_board(&model))?;
     if let Some(folder) = lacks(device) {
         let folder = computer.name(&folder);
-        return Err(format!("the host in {} has no module {}: update it, or use another device", folder.display(), device.module()));
+        return Err(format!(
+            "the host in {} has no module {}: update it, or use another device",
+            folder.display(),
+            device.module()
+        ));
     }
     let ways = ways(&board, device, args.bus.as_deref())?;
     let own = target.as_ref().ok().map(|target| target.file(&device.file(args.name.as_deref())));
@@ -192,7 +196,9 @@ fn existing(target: &Target, device: &Device, args: &AddArgs) -> Result<Option<S
             device.name
         ));
     }
-    let is_it = |section: &&pinion_printer_config::Section| device.is_chip_of(section) && target.is_here(section) && !target.is_pinion_s(section);
+    let is_it = |section: &&pinion_printer_config::Section| {
+        device.is_chip_of(section) && target.is_here(section) && !target.is_pinion_s(section)
+    };
     let has_own = target.config().section(&wanted).is_some_and(|section| target.is_in(section, &own));
     let other = named.or_else(|| target.others(&own).find(is_it).filter(|_| args.name.is_none() && !has_own));
     Ok(other.map(|section| section.name.clone()))
@@ -256,7 +262,8 @@ fn place<'a>(
     if let Some(found) = all(ways).into_iter().find(is_placed) {
         return Ok(found);
     }
-    if let Some((way, _)) = device.way.iter().flat_map(|way| search.spots(way).into_iter().map(move |spot| (way, spot))).find(is_placed)
+    if let Some((way, _)) =
+        device.way.iter().flat_map(|way| search.spots(way).into_iter().map(move |spot| (way, spot))).find(is_placed)
         && args.bus.is_some()
     {
         return Err(format!(
@@ -282,11 +289,18 @@ fn place<'a>(
         }
     }
     let why = refusal.map(|(why, _)| why).unwrap_or_default();
-    Err(format!("{why}, and nothing else is free for {}: see pinion pins --used, and {PINS} for how chips share a bus", device.name))
+    Err(format!(
+        "{why}, and nothing else is free for {}: see pinion pins --used, and {PINS} for how chips share a bus",
+        device.name
+    ))
 }
 
 /// The Moonraker of a printer. `None` for another computer's, unless it is named.
-fn moonraker_of(args: &AddArgs, computer: &Computer, target: Result<&Target, &String>) -> Result<Option<String>, String> {
+fn moonraker_of(
+    args: &AddArgs,
+    computer: &Computer,
+    target: Result<&Target, &String>,
+) -> Result<Option<String>, String> {
     match (&args.moonraker, target) {
         (Some(address), _) => Ok(Some(address.clone())),
         (None, Ok(target)) if computer.is_this() => target.moonraker(computer).map(Some),
@@ -309,7 +323,13 @@ fn refuse_while_printing(computer: &Computer, moonraker: Option<&str>) -> Result
 }
 
 /// Asks before a change. `done` are the files that this call has changed already.
-fn ask(args: &AddArgs, computer: &Computer, moonraker: Option<&str>, report: &mut Report, question: &str) -> Result<(), String> {
+fn ask(
+    args: &AddArgs,
+    computer: &Computer,
+    moonraker: Option<&str>,
+    report: &mut Report,
+    question: &str,
+) -> Result<(), String> {
     let refused = match report.changed.is_empty() {
         true => "nothing is changed".to_owned(),
         false => format!("the rest is not changed, but {} is", report.changed.join(", ")),
@@ -359,7 +379,14 @@ fn command(args: &AddArgs, undo: bool) -> String {
 }
 
 /// Shows changes, asks, and makes them.
-fn make(args: &AddArgs, moonraker: Option<&str>, side: &Side, edits: &[Edit], question: &str, report: &mut Report) -> Result<(), String> {
+fn make(
+    args: &AddArgs,
+    moonraker: Option<&str>,
+    side: &Side,
+    edits: &[Edit],
+    question: &str,
+    report: &mut Report,
+) -> Result<(), String> {
     let mut all = report.values.get("changes").and_then(Value::as_array).cloned().unwrap_or_default();
     for edit in edits {
         let (old, new) = edit.lines();
@@ -421,7 +448,8 @@ impl Work<'_> {
 
     /// Does it. Without a printer, all but its configuration.
     fn run(&mut self, target: Result<Target, String>) -> Result<(), String> {
-        let written = target.as_ref().map(|target| target.written_pins(self.device, self.way, self.name())).unwrap_or_default();
+        let written =
+            target.as_ref().map(|target| target.written_pins(self.device, self.way, self.name())).unwrap_or_default();
         let wires = match &self.there {
             Some(_) => self.search.wires(self.device, self.way, &self.spot, &written, None)?,
             None => self.search.wires(self.device, self.way, &self.spot, &written, self.args.pin.as_deref())?,
@@ -437,7 +465,14 @@ impl Work<'_> {
         let (boot, mut state) = self.plan_boot()?;
         self.report.set("bus", json!(state.name()));
         if !boot.is_empty() {
-            make(self.args, moonraker.as_deref(), &Side::new(self.computer, None), &boot, "Change these files?", self.report)?;
+            make(
+                self.args,
+                moonraker.as_deref(),
+                &Side::new(self.computer, None),
+                &boot,
+                "Change these files?",
+                self.report,
+            )?;
             let is_live = self.computer.is_this() && !self.args.dry_run;
             if is_live && state == State::NotLoaded {
                 let loaded = Command::new("modprobe").arg("i2c-dev").status();
@@ -507,7 +542,13 @@ impl Work<'_> {
     }
 
     /// Writes the sections, and has the host read them.
-    fn configure(&mut self, target: &Target, wires: &[Wire], address: Option<u8>, moonraker: Option<&str>) -> Result<(), String> {
+    fn configure(
+        &mut self,
+        target: &Target,
+        wires: &[Wire],
+        address: Option<u8>,
+        moonraker: Option<&str>,
+    ) -> Result<(), String> {
         let side = Side::new(self.computer, Some(target.owner));
         let (mcu, link, is_missing) = target.mcu(self.args.mcu.as_deref())?;
         if self.computer.is_this() && !self.args.dry_run && !serves(self.computer, &link) {
@@ -548,7 +589,8 @@ impl Work<'_> {
         self.report.line("Next:");
         next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
         if self.device.resonance
-            && let Some(remedy) = target.klippy(self.computer).and_then(|klippy| super::doctor::without_numpy(self.computer, &klippy))
+            && let Some(remedy) =
+                target.klippy(self.computer).and_then(|klippy| super::doctor::without_numpy(self.computer, &klippy))
         {
             self.report.line(format_args!("SHAPER_CALIBRATE needs numpy first: {remedy}"));
         }
@@ -560,7 +602,8 @@ impl Work<'_> {
     fn sections(&self, target: &Target, mcu: &str, wires: &[Wire], address: Option<u8>) -> Result<String, String> {
         let node = self.node();
         let mut text = self.device.named(&self.way.config, self.name()).replace("{mcu}", mcu);
-        let address = address.or_else(|| self.search.addresses(self.way, &self.spot).first().copied()).unwrap_or_default();
+        let address =
+            address.or_else(|| self.search.addresses(self.way, &self.spot).first().copied()).unwrap_or_default();
         let values = [
             ("spi_bus", node.to_owned()),
             ("i2c_bus", node.replacen('-', ".", 1)),
@@ -597,4 +640,3 @@ fn serves(computer: &Computer, link: &Path) -> bool {
     };
     link.exists() && computer.running().iter().any(is_its)
 }
-

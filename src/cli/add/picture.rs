@@ -15,9 +15,7 @@ pub(super) fn page(board: &Board, wires: &[Wire]) -> Page {
         Some(_) => String::new(),
     };
     let mut rows = vec![vec!["wire".to_owned(), "to".to_owned(), String::new()]];
-    rows.extend(wires.iter().map(|wire| {
-        vec![wire.chip.clone(), place(wire.pin), board.label(wire.pin).to_owned()]
-    }));
+    rows.extend(wires.iter().map(|wire| vec![wire.chip.clone(), place(wire.pin), board.label(wire.pin).to_owned()]));
     aligned(&rows).iter().for_each(|line| page.line(format_args!("  {line}")));
     page.line("");
     page.append(&header(board, wires));
@@ -114,8 +112,8 @@ pub(in crate::cli) fn svg(board: &Board, title: &str, wires: &[Wire]) -> String 
 mod tests {
     use super::*;
     use crate::cli::add::catalog::Catalog;
-    use crate::cli::computer::tests::Tree;
     use crate::cli::add::place::Search;
+    use crate::cli::computer::tests::Tree;
     use crate::cli::computer::uses::Uses;
     use std::collections::BTreeMap;
 

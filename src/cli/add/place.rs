@@ -32,7 +32,10 @@ pub(super) struct Search<'a> {
 
 /// The lines of config.txt that a way needs at this place.
 pub(super) fn config_lines(way: &Way, spot: &Spot) -> Vec<String> {
-    let select = spot.node.strip_prefix("spidev").map_or(String::new(), |numbers| format!("spi{}", numbers.replacen('.', "-", 1)));
+    let select = spot
+        .node
+        .strip_prefix("spidev")
+        .map_or(String::new(), |numbers| format!("spi{}", numbers.replacen('.', "-", 1)));
     way.config_txt.iter().map(|line| line.replace("{select}", &select)).collect()
 }
 
@@ -51,7 +54,8 @@ impl Search<'_> {
                 lines.iter().filter_map(|line| line.strip_prefix("dtoverlay=")).any(|wanted| is_of(loaded, wanted))
             })
         };
-        self.own.is_some_and(|own| Target::is_use_of(one, own)) || self.own.is_some() && one.source == Source::Boot && is_overlay()
+        self.own.is_some_and(|own| Target::is_use_of(one, own))
+            || self.own.is_some() && one.source == Source::Boot && is_overlay()
     }
 
     /// The places for a device that is connected in this way, the best one first. PWM and 1-Wire are where the boot loader
@@ -78,7 +82,13 @@ impl Search<'_> {
             let is_alone = way.bus == Kind::Leds || !way.wires.iter().any(|(_, role)| role == "cs");
             nodes.push(Resource::Controller(bus));
             match is_alone {
-                true => nodes.extend(self.uses.all.iter().map(|one| one.what.clone()).filter(|what| matches!(what, Resource::Select(own, _) if *own == bus))),
+                true => nodes.extend(
+                    self.uses
+                        .all
+                        .iter()
+                        .map(|one| one.what.clone())
+                        .filter(|what| matches!(what, Resource::Select(own, _) if *own == bus)),
+                ),
                 false => nodes.push(Resource::Select(bus, select)),
             }
         }
@@ -135,7 +145,14 @@ impl Search<'_> {
     /// # Errors
     ///
     /// One line: no line is free, or the chosen pin has no line.
-    pub(super) fn wires(&self, device: &Device, way: &Way, spot: &Spot, written: &BTreeMap<String, String>, pin: Option<&str>) -> Result<Vec<Wire>, String> {
+    pub(super) fn wires(
+        &self,
+        device: &Device,
+        way: &Way,
+        spot: &Spot,
+        written: &BTreeMap<String, String>,
+        pin: Option<&str>,
+    ) -> Result<Vec<Wire>, String> {
         let board = self.board;
         let has_line = way.wires.iter().any(|(_, role)| role == "line");
         if pin.is_some() && !has_line {
@@ -145,7 +162,8 @@ impl Search<'_> {
             let line = self.uses.names.line(written.get(role)?)?;
             self.uses.names.pin(board, &line)
         };
-        let taken: BTreeSet<usize> = spot.pins.values().copied().chain(way.wires.iter().filter_map(|(_, role)| earlier(role))).collect();
+        let taken: BTreeSet<usize> =
+            spot.pins.values().copied().chain(way.wires.iter().filter_map(|(_, role)| earlier(role))).collect();
         let is_free = |pin: usize| !taken.contains(&pin) && self.is_free(pin, spot, way);
         let chosen = match pin {
             None => None,
@@ -184,7 +202,8 @@ impl Search<'_> {
                 }
                 role => spot.pins.get(role).copied(),
             };
-            let pin = pin.ok_or_else(|| format!("{} has no free pin for {chip}: see pinion pins --used", board.name))?;
+            let pin =
+                pin.ok_or_else(|| format!("{} has no free pin for {chip}: see pinion pins --used", board.name))?;
             used.insert(pin);
             wires.push(Wire { chip: chip.clone(), role: role.clone(), pin });
         }

@@ -4,10 +4,10 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::Work;
 use super::boot;
 use super::place::config_lines;
 use super::side::{Edit, Side};
-use super::Work;
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Boot, Kind};
 use crate::cli::computer::uses::boot::lines;
@@ -77,7 +77,11 @@ impl Work<'_> {
             }
             _ => None,
         };
-        edits.extend(new.filter(|(_, old, new)| old != new).map(|(file, old, new)| Edit { file: file.into(), old: Some(old), new: Some(new) }));
+        edits.extend(new.filter(|(_, old, new)| old != new).map(|(file, old, new)| Edit {
+            file: file.into(),
+            old: Some(old),
+            new: Some(new),
+        }));
         if is_there && edits.is_empty() {
             return Ok((edits, State::There));
         }

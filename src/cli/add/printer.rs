@@ -174,7 +174,9 @@ impl Target {
     /// The MCU of a section: that of its pins, or its `i2c_mcu`.
     pub(super) fn mcu_of(&self, section: &Section) -> String {
         let named = ["i2c_mcu", "sensor_mcu"].iter().find_map(|key| section.text(key)).map(str::to_owned);
-        named.or_else(|| self.printer.pins_of(section).map(|named| named.pin.chip).next()).unwrap_or_else(|| "mcu".into())
+        named
+            .or_else(|| self.printer.pins_of(section).map(|named| named.pin.chip).next())
+            .unwrap_or_else(|| "mcu".into())
     }
 
     /// Whether a section is on an MCU of this computer. 1-Wire is always.
@@ -191,7 +193,9 @@ impl Target {
         let names = || self.mcus.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
         if let Some(wanted) = wanted {
             let link = self.mcus.get(wanted);
-            let link = link.ok_or_else(|| format!("--mcu: \"{wanted}\" is not an MCU of this computer: printer.cfg has {}", names()))?;
+            let link = link.ok_or_else(|| {
+                format!("--mcu: \"{wanted}\" is not an MCU of this computer: printer.cfg has {}", names())
+            })?;
             return Ok((wanted.to_owned(), link.clone(), false));
         }
         let usual = self.mcus.iter().find(|(_, link)| *link == Path::new(LINK));
@@ -203,7 +207,9 @@ impl Target {
                 let name = Some("host".to_owned()).filter(is_free).or_else(|| more.find(is_free)).unwrap_or_default();
                 Ok((name, LINK.into(), true))
             }
-            (None, 1) => Ok(self.mcus.iter().next().map(|(name, link)| (name.clone(), link.clone(), false)).unwrap_or_default()),
+            (None, 1) => {
+                Ok(self.mcus.iter().next().map(|(name, link)| (name.clone(), link.clone(), false)).unwrap_or_default())
+            }
             _ => Err(format!("this computer has several MCUs in printer.cfg: choose one with --mcu NAME: {}", names())),
         }
     }
@@ -221,9 +227,10 @@ impl Target {
             let Some((key, value)) = line.split_once(": ") else { continue };
             let role = value.rsplit_once('{').and_then(|(_, rest)| rest.strip_suffix('}'));
             if let (Some(role), Some(section)) = (role, section)
-                && let Some(pin) = self.printer.pins_of(section).find(|named| {
-                    section.text(key).is_some_and(|text| text.trim() == named.text)
-                })
+                && let Some(pin) = self
+                    .printer
+                    .pins_of(section)
+                    .find(|named| section.text(key).is_some_and(|text| text.trim() == named.text))
             {
                 found.insert(role.to_owned(), pin.pin.name);
             }
@@ -263,7 +270,14 @@ impl Target {
     /// # Errors
     ///
     /// One line: a file in the way cannot be read.
-    pub(super) fn plan(&self, side: &Side, device: &Device, name: Option<&str>, sections: &str, mcu: Option<&str>) -> Result<Vec<Edit>, String> {
+    pub(super) fn plan(
+        &self,
+        side: &Side,
+        device: &Device,
+        name: Option<&str>,
+        sections: &str,
+        mcu: Option<&str>,
+    ) -> Result<Vec<Edit>, String> {
         let mut edits = Vec::new();
         let mut make = |name: &str, text: String| -> Result<(), String> {
             let file = self.file(name);
@@ -316,7 +330,14 @@ impl Target {
     /// # Errors
     ///
     /// One line: a file cannot be read.
-    pub(super) fn plan_undo(&self, side: &Side, catalog: &Catalog, device: &Device, name: Option<&str>, left: &mut Vec<String>) -> Result<Vec<Edit>, String> {
+    pub(super) fn plan_undo(
+        &self,
+        side: &Side,
+        catalog: &Catalog,
+        device: &Device,
+        name: Option<&str>,
+        left: &mut Vec<String>,
+    ) -> Result<Vec<Edit>, String> {
         let mut edits = Vec::new();
         let stem = device.file(name);
         let file = self.file(&stem);
@@ -341,10 +362,12 @@ impl Target {
         let resonances = self.file(RESONANCES);
         let shared = [self.file(MCU), resonances.clone(), file.clone()];
         let others = side.computer.matching(self.folder().join("*.cfg"));
-        let others: Vec<PathBuf> = others.iter().map(|path| side.computer.name(path)).filter(|path| !shared.contains(path)).collect();
+        let others: Vec<PathBuf> =
+            others.iter().map(|path| side.computer.name(path)).filter(|path| !shared.contains(path)).collect();
         if let Some(text) = side.read(&resonances)?.filter(|text| is_ours(text) == Some(true)) {
             let chip = self.config().section(RESONANCES).and_then(|section| section.text("accel_chip"));
-            let is_other = |section: &&&Section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section));
+            let is_other =
+                |section: &&&Section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section));
             match stays.iter().find(is_other) {
                 // It is this other one's already.
                 Some(_) if chip.is_some_and(|chip| chip != device.section(name)) => {}
@@ -366,7 +389,8 @@ impl Target {
                 let named = section.settings().iter().filter(|setting| setting.key.contains("mcu"));
                 let is_listed = named.flat_map(|setting| setting.value.split(',')).any(|own| own.trim() == mcu);
                 let is_pin = |text: &str| text.trim_start_matches(['^', '~', '!', ' ']).starts_with(&format!("{mcu}:"));
-                let has_pin = section.settings().iter().flat_map(|setting| setting.value.split([',', '\n'])).any(is_pin);
+                let has_pin =
+                    section.settings().iter().flat_map(|setting| setting.value.split([',', '\n'])).any(is_pin);
                 section.kind() != "mcu" && (is_listed || has_pin)
             };
             match stays.iter().find(names_it) {
@@ -384,10 +408,20 @@ impl Target {
         let remaining = side.computer.matching(self.folder().join("*.cfg"));
         let mut remaining = remaining.iter().map(|path| side.computer.name(path)).filter(|path| !goes(path));
         // What klippy would still find of the device would be a section without its options.
-        let saved: Vec<&str> = self.config().sections().iter().filter(|section| self.is_in(section, &file)).map(|section| section.name.as_str()).collect();
+        let saved: Vec<&str> = self
+            .config()
+            .sections()
+            .iter()
+            .filter(|section| self.is_in(section, &file))
+            .map(|section| section.name.as_str())
+            .collect();
         let mut printer_cfg = self.config().without_saved(&self.text, &saved);
         if printer_cfg != self.text {
-            left.push(format!("the lines of [{}] in the SAVE_CONFIG block of {} go, too", saved.join("], ["), self.file.display()));
+            left.push(format!(
+                "the lines of [{}] in the SAVE_CONFIG block of {} go, too",
+                saved.join("], ["),
+                self.file.display()
+            ));
         }
         if self.text.contains(INCLUDE) || self.text.contains("[include pinion/") {
             let is_include = |line: &&str| line.trim_end() == INCLUDE;
@@ -401,7 +435,8 @@ impl Target {
                     printer_cfg = printer_cfg.split_inclusive('\n').filter(|line| !is_include(line)).collect();
                 }
                 None if edits.is_empty() => {}
-                None => left.push(format!("{} keeps its include: pinion add has not written this line", self.file.display())),
+                None => left
+                    .push(format!("{} keeps its include: pinion add has not written this line", self.file.display())),
             }
         }
         match printer_cfg == self.text {
@@ -441,7 +476,6 @@ pub(super) fn lacks(klippy: &Klippy, module: &str) -> Option<PathBuf> {
     (extras.join("bus.py").exists() && !is_there).then(|| folder.clone())
 }
 
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -479,17 +513,17 @@ mod tests {
         )]);
         let changes = plan(&tree, &target, "adxl345");
         let names: Vec<&str> = changes.iter().map(|(name, _)| name.as_str()).collect();
-        assert_eq!(
-            names,
-            ["pinion/host-mcu.cfg", "pinion/adxl345.cfg", "pinion/resonance_tester.cfg", "printer.cfg"]
-        );
+        assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/adxl345.cfg", "pinion/resonance_tester.cfg", "printer.cfg"]);
         assert!(changes[0].1.ends_with("[mcu host]\nserial: /tmp/klipper_host_mcu\n"));
         let tester = "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 125, 105, 20\n";
         assert!(changes[2].1.ends_with(tester), "{}", changes[2].1);
         assert!(changes[3].1.starts_with("[include pinion/*.cfg] # by pinion add\n# mine\n"));
         for (_, text) in &changes[..3] {
             assert_eq!(is_ours(text), Some(true));
-            assert_eq!(is_ours(&text.replace("serial", "Serial").replace("[x]", "[y]").replace("x: ", "")), Some(!text.contains("serial") && !text.contains("[x]")));
+            assert_eq!(
+                is_ours(&text.replace("serial", "Serial").replace("[x]", "[y]").replace("x: ", "")),
+                Some(!text.contains("serial") && !text.contains("[x]"))
+            );
         }
         assert_eq!(is_ours("[x]\n"), None);
     }
@@ -515,7 +549,8 @@ mod tests {
     /// An MCU of another computer, or of another board, is not this one's, whatever its name.
     #[test]
     fn the_mcu_of_this_computer_is_the_one_that_is_served_here() {
-        let mcu = |text: &str| read(&[("printer.cfg", text)]).1.mcu(None).map(|(name, _, is_missing)| (name, is_missing));
+        let mcu =
+            |text: &str| read(&[("printer.cfg", text)]).1.mcu(None).map(|(name, _, is_missing)| (name, is_missing));
         let bed = "[mcu bedpi]\nserial: /tmp/klipper_host_bedpi\n";
         let own = "[mcu zz]\nserial: /tmp/klipper_host_mcu\n";
         assert_eq!(mcu(""), Ok(("host".into(), true)));
@@ -531,7 +566,10 @@ mod tests {
     fn the_include_comes_where_no_section_is_cut() {
         let include = INCLUDE;
         for (text, new) in [
-            ("[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\n\n[x]\n", "[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\nNEW\n\n[x]\n"),
+            (
+                "[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\n\n[x]\n",
+                "[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\nNEW\n\n[x]\n",
+            ),
             ("[fan]\r\npin: x\r\n", "NEW\r\n[fan]\r\npin: x\r\n"),
             ("[include a*.cfg]", "[include a*.cfg]\nNEW\n"),
             ("", "NEW\n"),
@@ -603,10 +641,18 @@ mod tests {
     fn the_lines_of_an_earlier_call_are_found_by_the_template() {
         let catalog = Catalog::read().unwrap();
         let driver = "[manual_stepper feeder]\nstep_pin: host:GPIO17\ndir_pin: !host:GPIO27\nenable_pin: !host:GPIO6\n[tmc2209 manual_stepper feeder]\nuart_pin: host:ttyAMA3\n";
-        let (_tree, target) = read(&[("printer.cfg", "[include pinion/*.cfg]\n[mcu host]\nserial: /tmp/klipper_host_mcu\n"), ("pinion/tmc2209.cfg", driver), ("pinion/relay-bed.cfg", "[output_pin bed]\npin: !host:GPIO5\n")]);
+        let (_tree, target) = read(&[
+            ("printer.cfg", "[include pinion/*.cfg]\n[mcu host]\nserial: /tmp/klipper_host_mcu\n"),
+            ("pinion/tmc2209.cfg", driver),
+            ("pinion/relay-bed.cfg", "[output_pin bed]\npin: !host:GPIO5\n"),
+        ]);
         let written = |device: &str, name: Option<&str>| {
             let device = catalog.device(device).unwrap();
-            target.written_pins(device, &device.way[0], name).into_iter().map(|(role, pin)| format!("{role} {pin}")).collect::<Vec<_>>()
+            target
+                .written_pins(device, &device.way[0], name)
+                .into_iter()
+                .map(|(role, pin)| format!("{role} {pin}"))
+                .collect::<Vec<_>>()
         };
         assert_eq!(written("tmc2209", None), ["line GPIO17", "line2 GPIO27", "uart ttyAMA3", "up GPIO6"]);
         assert_eq!(written("relay", Some("bed")), ["line GPIO5"]);

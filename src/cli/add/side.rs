@@ -130,7 +130,10 @@ impl<'a> Side<'a> {
         match about {
             Ok(about) if about.mode() & 0o200 == 0 => {
                 let path = file.display();
-                Err(format!("{path} is read-only: chmod u+w {}, then call this again", word(self.computer.path(file).display())))
+                Err(format!(
+                    "{path} is read-only: chmod u+w {}, then call this again",
+                    word(self.computer.path(file).display())
+                ))
             }
             _ => Ok(()),
         }
@@ -184,7 +187,10 @@ impl<'a> Side<'a> {
     }
 
     fn make_one(&self, Edit { file, old, new }: &Edit, told: &mut Vec<String>) -> Result<(), String> {
-        let at = |file: &Path| { let file = file.to_owned(); move |error: io::Error| failed(&file, &error) };
+        let at = |file: &Path| {
+            let file = file.to_owned();
+            move |error: io::Error| failed(&file, &error)
+        };
         if self.read(file)? != *old {
             return Err(format!("{} has changed meanwhile: call this again", file.display()));
         }
@@ -213,7 +219,11 @@ impl<'a> Side<'a> {
             }
             None => {
                 if saved.is_some() {
-                    told.push(format!("{} stays: it is {} as it was before pinion add", copy.display(), file.display()));
+                    told.push(format!(
+                        "{} stays: it is {} as it was before pinion add",
+                        copy.display(),
+                        file.display()
+                    ));
                 }
                 self.write(file, new).map_err(at(file))
             }

@@ -119,22 +119,26 @@ impl Needs<'_> {
             let mut new = old.clone();
             let keeps = |what: &str, user: &Section, left: &mut Vec<String>| {
                 let section = &user.name;
-                left.push(format!("{} keeps \"{what}\": [{section}] in printer.cfg needs it. Call this again when it does not", file.display()));
+                left.push(format!(
+                    "{} keeps \"{what}\": [{section}] in printer.cfg needs it. Call this again when it does not",
+                    file.display()
+                ));
             };
             match board.boot {
                 Boot::ConfigTxt => {
                     if boot::has_changed_lines(&old, &own) {
-                        left.push(format!("{} keeps lines below \"# pinion add {own}\": they were changed since", file.display()));
+                        left.push(format!(
+                            "{} keeps lines below \"# pinion add {own}\": they were changed since",
+                            file.display()
+                        ));
                     }
                     for line in boot::own_lines(&old).into_iter().rev().filter(|line| line.device == own) {
                         match self.user(board, &line.line) {
                             None => new = boot::without(&new, &line),
-                            Some(user) => {
-                                match self.of_ours(user) {
-                                    Some(other) => new = boot::handed_over(&new, &line, &other),
-                                    None => keeps(&line.line, user, left),
-                                }
-                            }
+                            Some(user) => match self.of_ours(user) {
+                                Some(other) => new = boot::handed_over(&new, &line, &other),
+                                None => keeps(&line.line, user, left),
+                            },
                         }
                     }
                 }
@@ -162,7 +166,8 @@ impl Needs<'_> {
             }
         }
         let is_i2c = self.device.way.iter().any(|way| way.bus == Kind::I2c);
-        if is_i2c && self.others().all(|one| !matches!(one.what, Resource::I2c(..)))
+        if is_i2c
+            && self.others().all(|one| !matches!(one.what, Resource::I2c(..)))
             && let Some(text) = side.read(Path::new(MODULES))?.filter(|text| text == I2C_DEV)
         {
             edits.push(Edit { file: MODULES.into(), old: Some(text), new: None });
@@ -213,7 +218,13 @@ impl Needs<'_> {
             devices.any(|device| {
                 let ways = device.way.iter().filter(|way| {
                     // The place of the overlay is in it.
-                    way.config_txt.iter().any(|own| own == line || own.split("{select}").next().is_some_and(|head| own.contains("{select}") && line.starts_with(head)))
+                    way.config_txt.iter().any(|own| {
+                        own == line
+                            || own
+                                .split("{select}")
+                                .next()
+                                .is_some_and(|head| own.contains("{select}") && line.starts_with(head))
+                    })
                 });
                 ways.into_iter().any(|way| match &way.driver {
                     Some(driver) => section.text("sensor_pin").is_some_and(|pin| pin.contains(&format!("{driver}/"))),
@@ -222,7 +233,11 @@ impl Needs<'_> {
             })
         };
         let own = self.target.map(|target| (target, target.file(&self.device.file(self.name))));
-        let by_device = || own.as_ref().and_then(|(target, file)| target.config().sections().iter().filter(|section| !target.is_in(section, file)).find(needs));
+        let by_device = || {
+            own.as_ref().and_then(|(target, file)| {
+                target.config().sections().iter().filter(|section| !target.is_in(section, file)).find(needs)
+            })
+        };
         by_bus.into_iter().next().or_else(by_device)
     }
 

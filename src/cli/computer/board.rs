@@ -180,7 +180,8 @@ pub(in crate::cli) fn function(node: &str) -> String {
 /// The first file with a mistake. The tests find it before a user does.
 pub(in crate::cli) fn all() -> Result<Vec<Board>, String> {
     let board = |(id, text): (&'static str, &str)| {
-        let board: Board = toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {id}.toml: {error}"))?;
+        let board: Board =
+            toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {id}.toml: {error}"))?;
         Ok(Board { id, ..board })
     };
     BOARDS.into_iter().map(board).collect()

@@ -171,7 +171,8 @@ impl Computer {
             return Ok(path.to_owned());
         }
         let steps = |path: &Path| -> Vec<OsString> {
-            let names = path.components().rev().filter(|step| matches!(step, Component::Normal(_) | Component::ParentDir));
+            let names =
+                path.components().rev().filter(|step| matches!(step, Component::Normal(_) | Component::ParentDir));
             names.map(|step| step.as_os_str().to_owned()).collect()
         };
         // The last one is the next.

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! klippy's configuration, and the MCUs in it that are this computer's.
 
+use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -8,6 +9,7 @@ use pinion_printer_config::pins::{Aliases, Pin};
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::HOST_PATHS;
 
+use super::running::Running;
 use super::{Computer, klippy, units};
 use crate::cli::config;
 use crate::cli::settings::BoardName;
@@ -92,9 +94,12 @@ impl Printer {
     /// The MCUs that are this computer's own, with their links. Another computer's MCU (`pinion link`) and a simulated
     /// one have links of the same kind. So a link counts if it is the usual one, or if a Pinion serves it here.
     pub(in crate::cli) fn own_mcus(&self, computer: &Computer) -> BTreeMap<String, PathBuf> {
+        // A file may name many, and the processes are looked at once.
+        let running = OnceCell::new();
+        let running = || running.get_or_init(|| computer.running()).as_slice();
         let mcus = self.config.of_kind("mcu").filter_map(|section| {
             let name = section.name.strip_prefix("mcu ").map_or("mcu", str::trim);
-            let serial = section.text("serial").filter(|serial| is_served(computer, serial))?;
+            let serial = section.text("serial").filter(|serial| is_served(computer, &running, serial))?;
             Some((name.to_owned(), PathBuf::from(serial)))
         });
         mcus.collect()
@@ -132,16 +137,15 @@ impl Printer {
 }
 
 /// Whether a Pinion on this computer's own pins serves this link, or will.
-fn is_served(computer: &Computer, serial: &str) -> bool {
+fn is_served<'a>(computer: &Computer, running: &impl Fn() -> &'a [Running], serial: &str) -> bool {
     let Some(name) = serial.strip_prefix(HOST_PATHS) else { return false };
-    let serves = |running: super::running::Running| {
-        let unit = running.unit.as_deref() == Some(&*format!("pinion-mcu@{name}"));
-        let by = running.settings;
-        let is_real = by.as_ref().is_none_or(|by| by.board == BoardName::Linux);
-        is_real && (unit || by.is_some_and(|by| by.symlink == Path::new(serial)))
+    let unit = format!("pinion-mcu@{name}");
+    let serves = |running: &Running| {
+        let by = running.settings.as_ref();
+        let has_link = running.unit.as_ref() == Some(&unit) || by.is_some_and(|by| by.symlink == Path::new(serial));
+        has_link && by.is_none_or(|by| by.board == BoardName::Linux)
     };
     let is_set_up = || {
-        let unit = format!("pinion-mcu@{name}");
         let file = format!("/etc/pinion/{name}.toml");
         let settings = || {
             let path = computer.resolve(Path::new(&file)).ok()?;
@@ -150,7 +154,7 @@ fn is_served(computer: &Computer, serial: &str) -> bool {
         !units::enabled(computer, |own| own == unit).is_empty()
             && settings().is_none_or(|settings| settings.board == BoardName::Linux)
     };
-    serial == LINK || is_set_up() || computer.running().into_iter().any(serves)
+    serial == LINK || running().iter().any(serves) || is_set_up()
 }
 
 /// The chip and the line that a numeric name means: `gpio17` and `gpiochip0/gpio17`.

@@ -95,7 +95,11 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<String>) -> Vec<Finding>
 }
 
 /// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
-pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(PathBuf, String)>) -> Vec<Finding> {
+pub(super) fn line_leds(
+    computer: &Computer,
+    instances: &[Instance],
+    pins: &BTreeSet<(PathBuf, String)>,
+) -> Vec<Finding> {
     let own = |link: &Path| {
         let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
         own.find(|instance| instance.link.as_deref() == Some(link))

@@ -16,7 +16,6 @@ use pinion_linux::pins::{Names, line_number};
 
 use super::instance::Instance;
 
-
 /// The pins whose MCU is one of these instances, and has this computer's lines.
 pub(super) fn of_instances<'a>(instances: &[Instance], pins: &'a BTreeSet<(PathBuf, String)>) -> BTreeSet<&'a str> {
     let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);

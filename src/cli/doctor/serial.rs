@@ -106,7 +106,9 @@ fn missing(computer: &Computer, named: &str) -> String {
         true if is_taken && ["ttyAMA0", "serial0", "serial1"].contains(&named) => no_bluetooth(computer),
         true => {
             let config = pi_config(computer).unwrap_or("config.txt");
-            format!("add the overlay of a UART to {config} (/usr/share/doc/pinion-mcu/guide/pins.md lists them), and reboot")
+            format!(
+                "add the overlay of a UART to {config} (/usr/share/doc/pinion-mcu/guide/pins.md lists them), and reboot"
+            )
         }
         false => "plug its adapter in, or enable it in the device tree (pinion pins lists the ports)".to_owned(),
     }

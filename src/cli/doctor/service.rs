@@ -105,7 +105,8 @@ fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
     });
     let policies: Vec<bool> = policies.collect();
     let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {}", word(unit)));
-    if !policies.is_empty() && !policies.contains(&true)
+    if !policies.is_empty()
+        && !policies.contains(&true)
         && let Some((why, remedy)) = no_real_time(computer, pid)
     {
         let found = format!("Pinion (process {pid}) does not run in real time: {why}");
@@ -134,7 +135,10 @@ fn no_real_time(computer: &Computer, pid: u32) -> Option<(&'static str, String)>
     });
     if has_none {
         let why = "the kernel (RT_GROUP_SCHED) gives its control group no share of it";
-        return Some((why, "sudo sysctl kernel.sched_rt_runtime_us=-1, or boot a kernel without RT_GROUP_SCHED".into()));
+        return Some((
+            why,
+            "sudo sysctl kernel.sched_rt_runtime_us=-1, or boot a kernel without RT_GROUP_SCHED".into(),
+        ));
     }
     let marks = ["/.dockerenv", "/run/.containerenv", "/run/systemd/container"];
     let is_container = marks.iter().any(|file| computer.exists(file));

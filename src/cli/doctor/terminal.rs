@@ -229,10 +229,10 @@ fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> b
 
 #[cfg(test)]
 mod tests {
-    use crate::cli::computer::klippy::klippys;
     use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::klippy::klippys;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
 

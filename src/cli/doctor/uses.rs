@@ -26,7 +26,8 @@ pub(super) fn conflicts(uses: &Uses) -> Vec<Finding> {
     let mut findings = Vec::new();
     for one in sections {
         let rival = |other: &&Use| {
-            let is_same = other.what == one.what || takes_all(&other.what, &one.what) || takes_all(&one.what, &other.what);
+            let is_same =
+                other.what == one.what || takes_all(&other.what, &one.what) || takes_all(&one.what, &other.what);
             let is_bus = one.function.is_some() && one.function == other.function;
             // klippy itself says if a printer.cfg uses a pin twice.
             is_same && !is_bus && other.source != one.source
@@ -79,7 +80,8 @@ fn takes_all(one: &Resource, other: &Resource) -> bool {
 pub(super) fn no_lines(uses: &Uses) -> Vec<Finding> {
     const CHECK: &str = "no_such_pin";
     let finding = |pin: &crate::cli::computer::uses::NoLine| {
-        let found = format!("[{}] ({}) names the pin {}, which this computer does not have", pin.section, pin.place, pin.pin);
+        let found =
+            format!("[{}] ({}) names the pin {}, which this computer does not have", pin.section, pin.place, pin.pin);
         match &pin.meant {
             Some(meant) => {
                 let chip = pin.pin.split_once(':').map_or(String::new(), |(chip, _)| format!("{chip}:"));
@@ -99,11 +101,16 @@ pub(super) fn slow_buses(computer: &Computer, klippys: &[Klippy]) -> Vec<Finding
         let own = printer.own_mcus(computer);
         for section in printer.config.sections().iter().filter(|section| ACCELEROMETERS.contains(&section.kind())) {
             let number = section.text("i2c_bus").and_then(|bus| bus.strip_prefix("i2c.")?.parse::<u32>().ok());
-            let Some(number) = number.filter(|_| own.contains_key(section.text("i2c_mcu").unwrap_or("mcu"))) else { continue };
+            let Some(number) = number.filter(|_| own.contains_key(section.text("i2c_mcu").unwrap_or("mcu"))) else {
+                continue;
+            };
             let file = format!("/sys/class/i2c-adapter/i2c-{number}/of_node/clock-frequency");
             let bytes = fs::read(computer.path(file)).ok().and_then(|bytes| <[u8; 4]>::try_from(bytes).ok());
-            let Some(rate_hz) = bytes.map(u32::from_be_bytes).filter(|rate_hz| *rate_hz < ACCELEROMETER_HZ) else { continue };
-            let found = format!("[{}] loses samples: the clock of i2c.{number} is {} kHz", section.name, rate_hz / 1000);
+            let Some(rate_hz) = bytes.map(u32::from_be_bytes).filter(|rate_hz| *rate_hz < ACCELEROMETER_HZ) else {
+                continue;
+            };
+            let found =
+                format!("[{}] loses samples: the clock of i2c.{number} is {} kHz", section.name, rate_hz / 1000);
             let remedy = match is_pi(computer) {
                 true => format!("{}, and reboot", append(computer, "dtparam=i2c_arm_baudrate=400000")),
                 false => "set the clock of the bus to 400000 in the device tree".into(),
@@ -133,8 +140,11 @@ pub(in crate::cli) fn without_numpy(computer: &Computer, klippy: &Klippy) -> Opt
     let home = python.parent()?.parent()?;
     let settings = computer.text(home.join("pyvenv.cfg"))?;
     let has = |home: &Path| {
-        let folders = ["lib/python3*/site-packages/numpy", "lib/python3*/dist-packages/numpy", "lib/python3/dist-packages/numpy"];
-        folders.iter().any(|folder| computer.matching(home.join(folder)).iter().any(|path| computer.exists(computer.name(path))))
+        let folders =
+            ["lib/python3*/site-packages/numpy", "lib/python3*/dist-packages/numpy", "lib/python3/dist-packages/numpy"];
+        folders
+            .iter()
+            .any(|folder| computer.matching(home.join(folder)).iter().any(|path| computer.exists(computer.name(path))))
     };
     let is_system_s = settings.lines().any(|line| line.replace(' ', "") == "include-system-site-packages=true");
     if has(home) || is_system_s && [Path::new("/usr"), Path::new("/usr/local")].into_iter().any(has) {

@@ -62,7 +62,9 @@ fn page(uses: &Uses) -> Page {
         return page;
     }
     let pin = |one: &Use| match (&one.what, &uses.board) {
-        (Resource::Line(line), Some(board)) => uses.names.pin(board, line).map_or(String::new(), |pin| format!("pin {pin}")),
+        (Resource::Line(line), Some(board)) => {
+            uses.names.pin(board, line).map_or(String::new(), |pin| format!("pin {pin}"))
+        }
         _ => String::new(),
     };
     let row = |one: &Use| vec![one.what.to_string(), pin(one), one.user.clone(), one.place.clone()];

@@ -168,10 +168,11 @@ fn entry(name: &str) -> Option<&'static str> {
 fn has_parameter(entry: &str, key: &str) -> bool {
     let pins = key.starts_with("pins_") && entry.contains("pins_");
     let select = chip_select(key).is_some() && entry.contains("spi?");
-    pins || select || entry.split(' ').any(|token| {
-        let name = token.split(['=', '?', '@']).next().unwrap_or_default();
-        name == key || name.strip_prefix("spi0.") == Some(key)
-    })
+    pins || select
+        || entry.split(' ').any(|token| {
+            let name = token.split(['=', '?', '@']).next().unwrap_or_default();
+            name == key || name.strip_prefix("spi0.") == Some(key)
+        })
 }
 
 /// The chip select of a parameter: `spi0-1` or `spi0-1-present`.
@@ -233,7 +234,8 @@ impl Uses {
             };
             // The last one counts, so an earlier one is no user.
             let is_it = |(own, _): &(String, String)| parameter(own) == parameter(key);
-            let is_later = later.iter().any(|other| other.is_sure && other.name.is_empty() && other.parameters.iter().any(is_it));
+            let is_later =
+                later.iter().any(|other| other.is_sure && other.name.is_empty() && other.parameters.iter().any(is_it));
             if is_on(value) && !is_later {
                 let user = if key == "enable_uart" { format!("{key}={value}") } else { format!("dtparam={key}") };
                 self.add_lines(lines.iter().copied(), &user, &loaded.place, Some(function));
@@ -264,15 +266,18 @@ impl Uses {
             return;
         };
         let tokens = || entry.split(' ').filter(|token| !token.is_empty());
-        let function = tokens().find_map(|token| token.strip_prefix('@').filter(|name| u8::from_str_radix(name, 16).is_err()));
+        let function =
+            tokens().find_map(|token| token.strip_prefix('@').filter(|name| u8::from_str_radix(name, 16).is_err()));
         let mut lines: Vec<u32> = Vec::new();
         for token in tokens() {
             if let Some(pins) = two_pins(token) {
-                let chosen = loaded.parameters.iter().rev().find_map(|(key, value)| two_pins(key).filter(|_| is_on(value)));
+                let chosen =
+                    loaded.parameters.iter().rev().find_map(|(key, value)| two_pins(key).filter(|_| is_on(value)));
                 lines.extend(chosen.unwrap_or(pins));
             } else if let Some((name, address)) = token.split_once('@') {
                 let Ok(address) = u16::from_str_radix(address, 16) else { continue };
-                let given = loaded.set("addr").and_then(|text| u16::from_str_radix(text.trim_start_matches("0x"), 16).ok());
+                let given =
+                    loaded.set("addr").and_then(|text| u16::from_str_radix(text.trim_start_matches("0x"), 16).ok());
                 if name.is_empty() || loaded.set(name).is_some_and(is_on) {
                     push(Resource::I2c(1, Some(given.unwrap_or(address))), Some("i2c1"));
                 }
@@ -321,7 +326,8 @@ impl Uses {
                 };
                 let is_its = |way: &Vec<String>| {
                     way.split_first().is_some_and(|(own, parameters)| {
-                        let set = |line: &String| line.split_once('=').is_some_and(|(key, wanted)| value(key) == wanted);
+                        let set =
+                            |line: &String| line.split_once('=').is_some_and(|(key, wanted)| value(key) == wanted);
                         (own == name || own.strip_prefix(&prefix) == Some(name)) && parameters.iter().all(set)
                     })
                 };

@@ -35,13 +35,16 @@ impl Names {
         let found = inventory.map(|inventory| &inventory.chips[..]).unwrap_or_default();
         let count = |lines: usize| u32::try_from(lines).unwrap_or(u32::MAX);
         let chips = found.iter().map(|chip| (chip.number, (chip.label.clone(), count(chip.lines.len())))).collect();
-        let lines = found.iter().flat_map(|chip| (0..).zip(&chip.lines).map(move |(line, about)| (chip.number, line, about)));
+        let lines =
+            found.iter().flat_map(|chip| (0..).zip(&chip.lines).map(move |(line, about)| (chip.number, line, about)));
         let named = lines.filter_map(|(chip, line, about)| Some((about.name.clone()?, (chip, line)))).collect();
         let header = match inventory.and_then(|inventory| Some((inventory, inventory.header()?))) {
             Some((inventory, header)) => {
                 (0..16).filter(|n| *n == header.number || inventory.renumbered(*n).is_some()).collect()
             }
-            None if model(computer).contains("Pi 5") || board.is_some_and(|board| board.id == "raspberry-pi-5") => vec![0, 4],
+            None if model(computer).contains("Pi 5") || board.is_some_and(|board| board.id == "raspberry-pi-5") => {
+                vec![0, 4]
+            }
             None => vec![0],
         };
         Names { maker, header, chips, named }
@@ -99,7 +102,9 @@ impl Names {
             Maker::Raspberry => self.line(&name.to_ascii_uppercase()),
             Maker::Allwinner => {
                 let mut letters = name.strip_prefix(['P', 'p'])?.chars();
-                let bank = u32::from(letters.next()?.to_ascii_uppercase()).checked_sub(u32::from('A')).filter(|bank| *bank < 26)?;
+                let bank = u32::from(letters.next()?.to_ascii_uppercase())
+                    .checked_sub(u32::from('A'))
+                    .filter(|bank| *bank < 26)?;
                 let line: u32 = letters.as_str().parse().ok().filter(|line| *line < 32)?;
                 let second = u32::from('L') - u32::from('A');
                 match bank.checked_sub(second) {

@@ -24,7 +24,7 @@ mod services;
 pub(in crate::cli) use lines::Names;
 
 /// Highest number of uses. A hostile file could name many.
-const USES_MAX: usize = 20_000;
+const USES_MAX: usize = 4_000;
 
 /// A part of the computer.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -52,7 +52,9 @@ pub(in crate::cli) enum Resource {
 impl std::fmt::Display for Resource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Resource::Line(name) | Resource::Pwm(name) | Resource::Port(name) | Resource::Sensor(name) => f.write_str(name),
+            Resource::Line(name) | Resource::Pwm(name) | Resource::Port(name) | Resource::Sensor(name) => {
+                f.write_str(name)
+            }
             Resource::Device(name) => f.write_str(name),
             Resource::Select(bus, select) => write!(f, "spidev{bus}.{select}"),
             Resource::Controller(bus) => write!(f, "spi{bus}"),
@@ -118,7 +120,14 @@ impl Uses {
         inventory: Option<&Inventory>,
     ) -> Uses {
         let names = Names::of(computer, board, inventory);
-        let mut uses = Uses { names, board: board.cloned(), all: Vec::new(), loaded: Vec::new(), no_lines: Vec::new(), mcus: BTreeMap::new() };
+        let mut uses = Uses {
+            names,
+            board: board.cloned(),
+            all: Vec::new(),
+            loaded: Vec::new(),
+            no_lines: Vec::new(),
+            mcus: BTreeMap::new(),
+        };
         if let Some(board) = board {
             uses.add_boot(computer, board);
         }
@@ -159,7 +168,9 @@ impl Uses {
                     Some((bus, _)) if is_alone => Resource::Controller(bus),
                     Some((bus, select)) => Resource::Select(bus, select),
                     None if name == "None" || name.starts_with("iio") || name.contains("voltage") => continue,
-                    None if ["tty", "serial"].iter().any(|kind| name.starts_with(kind)) => Resource::Port(name.to_owned()),
+                    None if ["tty", "serial"].iter().any(|kind| name.starts_with(kind)) => {
+                        Resource::Port(name.to_owned())
+                    }
                     None if name.contains("/pwm") => Resource::Pwm(self.pwm_name(computer, name)),
                     None if name.starts_with("analog") => continue,
                     None => match self.names.line(name) {
@@ -179,7 +190,8 @@ impl Uses {
             }
             let i2c_mcu = section.text("i2c_mcu").unwrap_or("mcu");
             if let Some(bus) = section.text("i2c_bus").and_then(i2c_number).filter(|_| own.contains_key(i2c_mcu)) {
-                let address = section.whole("i2c_address", 0).ok().flatten().and_then(|address| u16::try_from(address).ok());
+                let address =
+                    section.whole("i2c_address", 0).ok().flatten().and_then(|address| u16::try_from(address).ok());
                 found.push((Resource::I2c(bus, address), place("i2c_bus")));
             }
             if let Some(serial) = section.text("serial_no") {
@@ -202,11 +214,17 @@ impl Uses {
         };
         if let (Some(node), Some(board)) = (node, self.board.clone()) {
             let spots = board.bus.values().flat_map(board::Bus::spots);
-            for spot in spots.filter(|spot| spot.node == node || node.ends_with(['.', '_']) && spot.node.starts_with(&node)) {
+            for spot in
+                spots.filter(|spot| spot.node == node || node.ends_with(['.', '_']) && spot.node.starts_with(&node))
+            {
                 let pins = self.pins(&board, &spot);
                 let lines: Vec<String> = pins.values().filter_map(|pin| self.names.of_pin(&board, *pin)).collect();
                 for line in lines {
-                    self.add(Use { what: Resource::Line(line), function: Some(board::function(&spot.node)), ..one.clone() });
+                    self.add(Use {
+                        what: Resource::Line(line),
+                        function: Some(board::function(&spot.node)),
+                        ..one.clone()
+                    });
                 }
             }
         }
@@ -238,7 +256,8 @@ impl Uses {
 
     /// Adds what the kernel and other programs hold now.
     fn add_kernel(&mut self, computer: &Computer, inventory: Option<&Inventory>) {
-        let one = |what, user: String, place: String, function| Use { what, user, place, source: Source::Kernel, function };
+        let one =
+            |what, user: String, place: String, function| Use { what, user, place, source: Source::Kernel, function };
         let sysfs = Sysfs::scan(&computer.path("/"));
         for chip in inventory.map(|inventory| &inventory.chips[..]).unwrap_or_default() {
             for (offset, line) in (0u32..).zip(&chip.lines) {
@@ -259,7 +278,9 @@ impl Uses {
             let driver = fs::read_link(&path).ok();
             let driver = driver.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
             let device = path.parent().and_then(Path::file_name).and_then(|name| name.to_str());
-            let select = device.and_then(|device| device.strip_prefix("spi")).and_then(|rest| spi_node(&format!("spidev{rest}")));
+            let select = device
+                .and_then(|device| device.strip_prefix("spi"))
+                .and_then(|rest| spi_node(&format!("spidev{rest}")));
             if let (Some(driver), Some((bus, select))) = (driver.filter(|driver| *driver != "spidev"), select) {
                 self.add(one(Resource::Select(bus, select), format!("driver {driver}"), "/sys/bus/spi".into(), None));
             }
@@ -267,7 +288,12 @@ impl Uses {
         for bus in &sysfs.i2c {
             for chip in bus.chips.iter().filter(|chip| chip.driver.is_some()) {
                 let what = Resource::I2c(bus.number, Some(chip.address));
-                self.add(one(what, format!("driver {}", chip.driver.as_deref().unwrap_or_default()), "/sys/bus/i2c".into(), None));
+                self.add(one(
+                    what,
+                    format!("driver {}", chip.driver.as_deref().unwrap_or_default()),
+                    "/sys/bus/i2c".into(),
+                    None,
+                ));
             }
         }
         for chip in &sysfs.pwm {
@@ -303,7 +329,9 @@ impl Uses {
         };
         let pin = self.names.pin(board, line)?;
         let mut buses = board.bus.iter().filter(|(kind, _)| is_kind(**kind));
-        let (_, bus) = buses.find(|(_, bus)| bus.spots().any(|spot| self.pins(board, &spot).values().any(|own| *own == pin)) || bus.holds.contains(&pin))?;
+        let (_, bus) = buses.find(|(_, bus)| {
+            bus.spots().any(|spot| self.pins(board, &spot).values().any(|own| *own == pin)) || bus.holds.contains(&pin)
+        })?;
         Some(board::function(&bus.node))
     }
 

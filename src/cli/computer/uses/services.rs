@@ -43,7 +43,9 @@ impl Uses {
         for path in beside(computer, configs, "crowsnest.conf") {
             let Ok(config) = Config::read_from(computer, &path) else { continue };
             for section in config.of_kind("cam") {
-                let Some(device) = section.text("device").filter(|device| device.starts_with("/dev/")) else { continue };
+                let Some(device) = section.text("device").filter(|device| device.starts_with("/dev/")) else {
+                    continue;
+                };
                 self.add(Use {
                     what: Resource::Device(device.to_owned()),
                     user: format!("crowsnest's [{}]", section.name),
