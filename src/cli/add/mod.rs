@@ -150,6 +150,12 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
     {
         return Err(format!("--name: the first one has no name: pinion add {}", device.name));
     }
+    let driver = device.way.iter().find_map(|way| way.driver.as_deref()).filter(|_| args.name.is_some());
+    if let Some(driver) = driver.filter(|_| !args.undo) {
+        return Err(format!(
+            "--name: only one {driver} has a name in printer.cfg, because its channels have the driver's"
+        ));
+    }
     if args.config.is_some()
         && let Err(why) = &target
     {

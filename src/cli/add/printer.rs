@@ -394,11 +394,10 @@ impl Target {
                 section.kind() != "mcu" && (is_listed || has_pin)
             };
             match stays.iter().find(names_it) {
-                Some(user) => {
-                    if !self.is_pinion_s(user) {
-                        left.push(format!("{} stays: [{}] uses [mcu {mcu}]", mcu_file.display(), user.name));
-                    }
+                Some(user) if !self.is_pinion_s(user) => {
+                    left.push(format!("{} stays: [{}] uses [mcu {mcu}]", mcu_file.display(), user.name));
                 }
+                Some(_) => {}
                 // Without its include, klippy does not read the others now.
                 None if own.is_some() || others.is_empty() => edits.push(gone(&mcu_file, &text)),
                 None => {}

@@ -80,12 +80,12 @@ fn read(computer: &Computer, own: &[&str], file: &Path, depth: usize, state: &mu
             continue;
         }
         let conditions = [(state.is_conditional, state.model), (state.is_other, state.other)];
-        let conditions = conditions.into_iter().filter(|(is, _)| *is).map(|(_, applies)| applies);
-        let applies = conditions.fold(Some(true), |all, one| match (all, one) {
-            (Some(false), _) | (_, Some(false)) => Some(false),
-            (Some(true), Some(true)) => Some(true),
-            _ => None,
-        });
+        let has = |wanted: Option<bool>| conditions.iter().any(|(is, applies)| *is && *applies == wanted);
+        let applies = match (has(Some(false)), has(None)) {
+            (true, _) => Some(false),
+            (_, true) => None,
+            _ => Some(true),
+        };
         if let Some(name) = text.strip_prefix("include ").map(str::trim) {
             if depth < INCLUDES_MAX && applies != Some(false) && !name.contains("..") {
                 let included = file.with_file_name(name.trim_start_matches('/'));
