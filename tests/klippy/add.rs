@@ -4,6 +4,7 @@
 //! `MOONRAKER_PYTHON` names a Python that has Moonraker (`pip install moonraker`).
 
 use std::fs;
+use std::io::{BufRead as _, BufReader};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -195,22 +196,29 @@ fn klippy_accepts_what_each_device_writes() {
         }
         put("dictionary", &known.to_string());
         put("gcode", "");
-        let ended = Command::new(super::klippy::python())
+        let mut klippy = Command::new(super::klippy::python())
             // klippy fails if git has nothing to say of a checkout.
             .env("GIT_DIR", path("none"))
             .arg(checkout.join("klippy/klippy.py"))
             .arg(path("config/printer.cfg"))
-            .args(["-i"])
+            .arg("-i")
             .arg(path("gcode"))
             .arg("-o")
             .arg(path("output"))
             .arg("-d")
             .arg(path("dictionary"))
-            .output()
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
             .unwrap();
-        let log = String::from_utf8_lossy(&ended.stdout).into_owned() + &String::from_utf8_lossy(&ended.stderr);
         // Some chips are read at the start, and nobody answers in this mode: the configuration is done by then.
-        assert!(log.contains("Configured MCU 'mcu'"), "{device}:\n{written}\n{log}");
+        let mut log = String::new();
+        let lines = BufReader::new(klippy.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let is_done = |line: &String| line.contains("Configured MCU 'mcu'");
+        let done = lines.inspect(|line| log += &format!("{line}\n")).find(is_done);
+        let _ = klippy.kill();
+        klippy.wait().unwrap();
+        assert!(done.is_some(), "{device}:\n{written}\n{log}");
         for more in [&["--name", "second", "--undo"][..], &["--undo"]] {
             let undone = call(more);
             assert!(undone.status.success(), "{device}: {undone:?}");
