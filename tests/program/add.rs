@@ -565,8 +565,8 @@ fn a_bus_that_a_section_of_the_user_needs_stays() {
     let printer_cfg = card.read(PRINTER);
     card.put(PRINTER, &format!("{printer_cfg}\n[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
     let printed = card.added(&["adxl345", "--undo", "--yes"]);
-    let keeps = "/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] in printer.cfg needs it";
-    assert!(printed.contains(keeps), "{printed}");
+    let keeps = format!("/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] (/{PRINTER}) needs it");
+    assert!(printed.contains(&keeps), "{printed}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
     card.put(PRINTER, PRINTER_CFG);
     card.added(&["adxl345", "--undo", "--yes"]);

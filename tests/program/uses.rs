@@ -554,3 +554,17 @@ fn two_calls_at_once_lose_nothing() {
         assert_eq!(card.read(PRINTER).matches("[include pinion/*.cfg]").count(), 1);
     }
 }
+
+/// The other printer of this computer needs the bus.
+#[test]
+fn an_undo_for_one_printer_leaves_the_other_one_s_bus() {
+    let card = Card::pi();
+    let second = "home/pi/printer_2_data/config/printer.cfg";
+    let config = format!("/{PRINTER}");
+    card.put(second, &format!("{HOST}[lis2dw]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
+    card.added(&["adxl345", "--yes", "--config", &config]);
+    assert!(card.refused(&["adxl345", "--yes", "--undo"]).contains("there are several hosts"));
+    let told = card.added(&["adxl345", "--yes", "--undo", "--config", &config]);
+    assert!(told.contains(&format!("keeps \"dtparam=spi=on\": [lis2dw] (/{second}) needs it")), "{told}");
+    assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
+}

@@ -255,7 +255,7 @@ mod tests {
             let computer = tree.computer();
             let board = Board::of(&computer, None).unwrap().unwrap();
             let lines = lines(&computer, &board, FILE);
-            config_txt(text, &lines, &loaded(&lines), "x", &wanted)
+            config_txt(text, &lines, &loaded(&lines, &board), "x", &wanted)
         };
         let changed = on(text);
         assert_eq!(on(&changed), changed, "a second time");

@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion add --undo`: removes the device's own files, and takes its lines at boot back if nothing else needs them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use nix::unistd::geteuid;
 use serde_json::json;
 
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Board, Boot, Kind};
+use crate::cli::computer::printer::configs;
 use crate::cli::computer::uses::{Resource, Source, Use, Uses};
 use pinion_printer_config::Section;
 use pinion_runtime::klippy::process::Process;
@@ -17,7 +19,7 @@ use super::plan::{I2C_DEV, MODULES};
 use super::printer::Target;
 use super::report::Report;
 use super::side::{Edit, Side};
-use super::{AddArgs, ask, boot, make, moonraker_of, refuse_while_printing};
+use super::{AddArgs, ask, boot, command, make, moonraker_of, refuse_while_printing};
 
 /// Takes a device back.
 pub(super) fn undo(
@@ -42,6 +44,8 @@ pub(super) fn undo(
             own = target.plan_undo(&side, catalog, device, name, &mut left)?;
             host = Some((side, target));
         }
+        // Without its sections, nobody knows what is still needed.
+        Err(why) if args.config.is_some() || !configs(computer).is_empty() => return Err(why.clone()),
         Err(why) => report.line(why),
     }
     let needs = Needs { uses, catalog, device, name, target: target.as_ref().ok() };
@@ -65,6 +69,9 @@ pub(super) fn undo(
     if args.dry_run {
         report.line("Nothing was changed (--dry-run).");
         return Ok(());
+    }
+    if computer.is_this() && !boot.is_empty() && !geteuid().is_root() {
+        return Err(format!("some of these files are root's: {}", command(args, true)));
     }
     if !own.is_empty() || !boot.is_empty() {
         ask(args, computer, moonraker.as_deref(), report, "Take this back?")?;
@@ -117,11 +124,11 @@ impl Needs<'_> {
             side.sweep(file);
             let old = side.read(file)?.unwrap_or_default();
             let mut new = old.clone();
-            let keeps = |what: &str, user: &Section, left: &mut Vec<String>| {
-                let section = &user.name;
+            let keeps = |what: &str, (user, place): &(String, PathBuf), left: &mut Vec<String>| {
                 left.push(format!(
-                    "{} keeps \"{what}\": [{section}] in printer.cfg needs it. Call this again when it does not",
-                    file.display()
+                    "{} keeps \"{what}\": {user} ({}) needs it. Call this again when it does not",
+                    file.display(),
+                    place.display()
                 ));
             };
             match board.boot {
@@ -135,9 +142,9 @@ impl Needs<'_> {
                     for line in boot::own_lines(&old).into_iter().rev().filter(|line| line.device == own) {
                         match self.user(board, &line.line) {
                             None => new = boot::without(&new, &line),
-                            Some(user) => match self.of_ours(user) {
+                            Some(user) => match self.of_ours(&user) {
                                 Some(other) => new = boot::handed_over(&new, &line, &other),
-                                None => keeps(&line.line, user, left),
+                                None => keeps(&line.line, &user, left),
                             },
                         }
                     }
@@ -152,9 +159,9 @@ impl Needs<'_> {
                             new = boot::without_settings(&old, &own, &mut changed);
                             left.extend(changed.into_iter().map(|why| format!("{}: {why}", file.display())));
                         }
-                        Some(user) => match self.of_ours(user) {
+                        Some(user) => match self.of_ours(&user) {
                             Some(other) => new = boot::settings_handed_over(&old, &own, &other),
-                            None => keeps(&settings.join("; "), user, left),
+                            None => keeps(&settings.join("; "), &user, left),
                         },
                     }
                 }
@@ -182,13 +189,8 @@ impl Needs<'_> {
         self.uses.all.iter().filter(move |one| matches!(one.source, Source::Printer(_)) && !is_own(one))
     }
 
-    /// The section of a use.
-    fn section(&self, one: &Use) -> Option<&Section> {
-        self.target?.config().section(one.user.trim_start_matches('[').trim_end_matches(']'))
-    }
-
-    /// A section that needs a bus of this kind.
-    fn user_of(&self, board: &Board, kind: Kind) -> Option<&Section> {
+    /// A section that needs a bus of this kind, with its file.
+    fn user_of(&self, board: &Board, kind: Kind) -> Option<(String, PathBuf)> {
         let bus = board.bus.get(&kind)?;
         let is_user = |one: &&Use| match (&one.what, kind) {
             (Resource::Select(number, _) | Resource::Controller(number), Kind::Spi | Kind::Leds) => {
@@ -200,52 +202,45 @@ impl Needs<'_> {
             (Resource::Port(name), Kind::Uart) => *name == bus.node,
             _ => false,
         };
-        self.others().filter(is_user).find_map(|one| self.section(one))
+        let one = self.others().find(is_user)?;
+        Some((one.user.clone(), one.place.rsplit_once(':').map_or_else(PathBuf::new, |(file, _)| file.into())))
     }
 
-    /// A section that needs this line of config.txt.
-    fn user(&self, board: &Board, line: &str) -> Option<&Section> {
-        let is_leds = |section: &&Section| section.kind() == "neopixel";
+    /// A section that needs this line of config.txt, with its file.
+    fn user(&self, board: &Board, line: &str) -> Option<(String, PathBuf)> {
         let buses = board.bus.iter().filter(|(_, bus)| bus.enable.iter().any(|own| own == line));
-        let by_bus = buses.filter_map(|(kind, bus)| {
-            let user = self.user_of(board, *kind)?;
+        let mut by_bus = buses.filter_map(|(kind, _)| {
             // The clock is held for LEDs only.
-            let is_clock = *kind == Kind::Leds && !line.starts_with("dt") && !bus.enable.is_empty();
-            if is_clock { Some(user).filter(is_leds) } else { Some(user) }
+            let is_clock = *kind == Kind::Leds && !line.starts_with("dt");
+            self.user_of(board, *kind).filter(|(user, _)| !is_clock || user.starts_with("[neopixel"))
         });
+        by_bus.next().or_else(|| self.user_of_line(line))
+    }
+
+    /// A section of a device that has this line as its own: a faster bus, or the driver of a chip.
+    fn user_of_line(&self, line: &str) -> Option<(String, PathBuf)> {
+        let target = self.target?;
+        let file = target.file(&self.device.file(self.name));
+        // The place of an overlay is in its line.
+        let is_line = |own: &String| {
+            own.split("{select}").next().is_some_and(|head| own == line || head != own && line.starts_with(head))
+        };
+        let ways = || {
+            let all = self.catalog.devices.iter().flat_map(|device| device.way.iter().map(move |way| (device, way)));
+            all.filter(|(_, way)| way.config_txt.iter().any(is_line))
+        };
         let needs = |section: &&Section| {
-            let mut devices = self.catalog.devices.iter();
-            devices.any(|device| {
-                let ways = device.way.iter().filter(|way| {
-                    // The place of the overlay is in it.
-                    way.config_txt.iter().any(|own| {
-                        own == line
-                            || own
-                                .split("{select}")
-                                .next()
-                                .is_some_and(|head| own.contains("{select}") && line.starts_with(head))
-                    })
-                });
-                ways.into_iter().any(|way| match &way.driver {
-                    Some(driver) => section.text("sensor_pin").is_some_and(|pin| pin.contains(&format!("{driver}/"))),
-                    None => way.bus == Kind::I2c && section.text("i2c_bus").is_some() && device.is_chip_of(section),
-                })
+            ways().any(|(device, way)| match &way.driver {
+                Some(driver) => section.text("sensor_pin").is_some_and(|pin| pin.contains(&format!("{driver}/"))),
+                None => way.bus == Kind::I2c && section.text("i2c_bus").is_some() && device.is_chip_of(section),
             })
         };
-        let own = self.target.map(|target| (target, target.file(&self.device.file(self.name))));
-        let by_device = || {
-            own.as_ref().and_then(|(target, file)| {
-                target.config().sections().iter().filter(|section| !target.is_in(section, file)).find(needs)
-            })
-        };
-        by_bus.into_iter().next().or_else(by_device)
+        let section = target.others(&file).find(needs)?;
+        Some((format!("[{}]", section.name), target.config().files_of(&section.name).next()?.to_owned()))
     }
 
     /// The name of the file in `pinion/` that has this section.
-    fn of_ours(&self, section: &Section) -> Option<String> {
-        let target = self.target?;
-        let mut files = target.config().files_of(&section.name);
-        let file = files.find(|file| file.starts_with(target.folder()))?;
-        Some(file.file_stem()?.to_str()?.to_owned())
+    fn of_ours(&self, (_, file): &(String, PathBuf)) -> Option<String> {
+        file.starts_with(self.target?.folder()).then(|| Some(file.file_stem()?.to_str()?.to_owned()))?
     }
 }

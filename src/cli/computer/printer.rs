@@ -72,8 +72,11 @@ impl Printer {
 
     /// The pins of a section.
     pub(in crate::cli) fn pins_of<'a>(&'a self, section: &'a Section) -> impl Iterator<Item = Named<'a>> {
-        let is_pin = section.kind() != "board_pins" && section.kind() != "duplicate_pin_override";
-        let options = section.settings().iter().filter(move |setting| is_pin && setting.key.contains("pin"));
+        // `pin_move_time` of a BLTouch is no pin, and a macro's variables are anything.
+        let has_pins =
+            !["board_pins", "duplicate_pin_override", "gcode_macro", "delayed_gcode"].contains(&section.kind());
+        let is_pin = |key: &str| ["pin", "pins"].contains(&key) || key.ends_with("_pin") || key.ends_with("_pins");
+        let options = section.settings().iter().filter(move |setting| has_pins && is_pin(&setting.key));
         options.flat_map(|setting| setting.value.split(',')).filter_map(move |text| {
             let pin = self.aliases.resolve(&Pin::parse(text, true, true).ok()?);
             Some(Named { section, text: text.trim(), pin })

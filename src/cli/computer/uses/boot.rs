@@ -33,6 +33,8 @@ pub(in crate::cli) struct Loaded {
     pub(in crate::cli) parameters: Vec<(String, String)>,
     pub(in crate::cli) place: String,
     pub(in crate::cli) is_sure: bool,
+    /// What it takes, from the table. `None` if it is not known.
+    takes: Option<&'static str>,
 }
 
 impl Loaded {
@@ -121,7 +123,7 @@ fn sections(computer: &Computer, board: &Board) -> Vec<&'static str> {
 }
 
 /// The overlays of a config.txt, and its own parameters as those of an overlay without a name.
-pub(in crate::cli) fn loaded(lines: &[Line]) -> Vec<Loaded> {
+pub(in crate::cli) fn loaded(lines: &[Line], board: &Board) -> Vec<Loaded> {
     let mut all = vec![];
     let parameters = |text: &str| -> Vec<(String, String)> {
         let parts = text.split(',').map(str::trim).filter(|part| !part.is_empty());
@@ -132,18 +134,19 @@ pub(in crate::cli) fn loaded(lines: &[Line]) -> Vec<Loaded> {
     let mut open: Option<usize> = None;
     for Line { text, place, applies } in lines.iter().filter(|line| line.applies != Some(false)) {
         let is_sure = *applies == Some(true);
-        let base = |parameters| Loaded { name: String::new(), parameters, place: place.clone(), is_sure };
+        let base = |parameters| Loaded { name: String::new(), parameters, place: place.clone(), is_sure, takes: None };
         if let Some(text) = text.strip_prefix("dtoverlay=") {
             open = None;
             let (name, rest) = text.split_at(text.find([',', ':']).unwrap_or(text.len()));
             if !name.trim().is_empty() {
                 open = Some(all.len());
                 let parameters = parameters(rest.get(1..).unwrap_or_default());
-                all.push(Loaded { name: name.trim().to_owned(), ..base(parameters) });
+                let takes = entry(name.trim(), board);
+                all.push(Loaded { name: name.trim().to_owned(), takes, ..base(parameters) });
             }
         } else if let Some(text) = text.strip_prefix("dtparam=") {
             for (key, value) in parameters(text) {
-                let is_its = |loaded: &Loaded| entry(&loaded.name).is_some_and(|entry| has_parameter(entry, &key));
+                let is_its = |loaded: &Loaded| loaded.takes.is_some_and(|entry| has_parameter(entry, &key));
                 match open.filter(|at| is_its(&all[*at])) {
                     Some(at) => all[at].parameters.push((key, value)),
                     None => all.push(base(vec![(key, value)])),
@@ -157,12 +160,16 @@ pub(in crate::cli) fn loaded(lines: &[Line]) -> Vec<Loaded> {
 }
 
 /// What an overlay takes, from the table. `None` if it is not known.
-fn entry(name: &str) -> Option<&'static str> {
-    let mut entries = OVERLAYS.lines().filter(|line| !line.starts_with('#') && !line.is_empty());
-    entries.find_map(|line| {
-        let (own, takes) = line.split_once(' ').unwrap_or((line, ""));
-        (own == name).then_some(takes)
-    })
+fn entry(name: &str, board: &Board) -> Option<&'static str> {
+    let of = |name: &str| {
+        let mut entries = OVERLAYS.lines().filter(|line| !line.starts_with('#') && !line.is_empty());
+        entries.find_map(|line| {
+            let (own, takes) = line.split_once(' ').unwrap_or((line, ""));
+            (own == name).then_some(takes)
+        })
+    };
+    let pi5 = if board.id == "raspberry-pi-5" { of(&format!("{name}-pi5")) } else { None };
+    pi5.or_else(|| of(name))
 }
 
 fn has_parameter(entry: &str, key: &str) -> bool {
@@ -209,7 +216,7 @@ impl Uses {
         let Some(file) = computer.first(&board.files.iter().map(String::as_str).collect::<Vec<_>>()) else { return };
         match board.boot {
             Boot::ConfigTxt => {
-                self.loaded = loaded(&lines(computer, board, file));
+                self.loaded = loaded(&lines(computer, board, file), board);
                 let loaded = self.loaded.clone();
                 for (at, one) in loaded.iter().enumerate() {
                     match one.name.as_str() {
@@ -261,7 +268,7 @@ impl Uses {
             let (user, place, function) = (user.clone(), loaded.place.clone(), function.map(str::to_owned));
             self.add(Use { what, user, place, source: Source::Boot, function });
         };
-        let Some(entry) = entry(&loaded.name) else {
+        let Some(entry) = loaded.takes else {
             push(Resource::Unknown(loaded.name.clone()), None);
             return;
         };
@@ -278,8 +285,10 @@ impl Uses {
                 let Ok(address) = u16::from_str_radix(address, 16) else { continue };
                 let given =
                     loaded.set("addr").and_then(|text| u16::from_str_radix(text.trim_start_matches("0x"), 16).ok());
+                // The bus of the header, unless another one is chosen.
+                let bus = loaded.parameters.iter().find_map(|(key, _)| key.strip_prefix("i2c")?.parse::<u32>().ok());
                 if name.is_empty() || loaded.set(name).is_some_and(is_on) {
-                    push(Resource::I2c(1, Some(given.unwrap_or(address))), Some("i2c1"));
+                    push(Resource::I2c(bus.unwrap_or(1), Some(given.unwrap_or(address))), None);
                 }
             } else if token == "spi?" {
                 for (bus, select) in loaded.parameters.iter().filter_map(|(key, _)| chip_select(key)) {

@@ -50,6 +50,11 @@ impl Names {
         Names { maker, header, chips, named }
     }
 
+    /// Whether the kernel has said which lines there are.
+    pub(super) fn knows_all(&self) -> bool {
+        !self.chips.is_empty()
+    }
+
     /// The one name of the line that Pinion takes this name for. `None` if there is no such line.
     pub(in crate::cli) fn line(&self, name: &str) -> Option<String> {
         if let Some((chip, line)) = line_of(name) {

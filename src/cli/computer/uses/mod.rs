@@ -177,6 +177,10 @@ impl Uses {
                         Some(line) => Resource::Line(line),
                         None => {
                             let meant = self.names.meant(name, self.board.as_ref());
+                            // The kernel may know a name of its own. Without the kernel, nobody can say.
+                            if meant.is_none() && !self.names.knows_all() && printer::line_of(name).is_none() {
+                                continue;
+                            }
                             let section = section.name.clone();
                             self.no_lines.push(NoLine { pin: named.text.to_owned(), section, place: at, meant });
                             continue;
@@ -263,8 +267,8 @@ impl Uses {
             for (offset, line) in (0u32..).zip(&chip.lines) {
                 let device = sysfs.devices.get(&(chip.label.clone(), offset));
                 let user = match (line.held, &line.consumer, device) {
-                    // Its lines are those of printer.cfg.
-                    (true, Some(consumer), _) if consumer == "pinion" => continue,
+                    // The lines of an MCU are those of printer.cfg.
+                    (true, Some(consumer), _) if ["pinion", "klipper"].contains(&consumer.as_str()) => continue,
                     (true, consumer, device) => consumer.as_ref().or(device).map_or("a driver", String::as_str),
                     (false, _, Some(device)) => device,
                     (false, ..) => continue,

@@ -68,6 +68,7 @@ fn overlays_take_their_pins_wherever_their_parameters_are() {
         ("dtoverlay=hifiberry-dac", &["GPIO18", "GPIO19", "GPIO20", "GPIO21"]),
         ("dtoverlay=i2c-rtc,ds3231", &["i2c.1 0x68"]),
         ("dtoverlay=i2c-sensor,bme280,addr=0x77", &["i2c.1 0x77"]),
+        ("dtoverlay=i2c-rtc,rv3028,i2c0", &["i2c.0 0x52"]),
         ("dtoverlay=vc4-kms-v3d", &[]),
         ("dtoverlay=a-hat-of-somebody,x=1", &["anything"]),
         ("dtparam=spi=on", &["GPIO7", "GPIO8", "GPIO9", "GPIO10", "GPIO11"]),
@@ -83,6 +84,18 @@ fn overlays_take_their_pins_wherever_their_parameters_are() {
     ] {
         assert_eq!(lines_of(text), lines, "{text}");
     }
+}
+
+/// The firmware takes another overlay on a Raspberry Pi 5.
+#[test]
+fn overlays_of_a_raspberry_pi_5() {
+    let tree = pi4(&[(
+        "boot/firmware/config.txt",
+        "dtoverlay=uart2\ndtparam=ctsrts\n[pi5]\ndtoverlay=spi3-1cs\n[pi4]\ndtoverlay=gpio-fan\n",
+    )]);
+    tree.put("proc/device-tree/model", "Raspberry Pi 5 Model B Rev 1.0\0");
+    let lines: Vec<String> = uses(&tree).sorted().map(|one| one.what.to_string()).collect();
+    assert_eq!(lines, ["GPIO4", "GPIO4", "GPIO5", "GPIO5", "GPIO6", "GPIO6", "GPIO7", "GPIO7"]);
 }
 
 /// An overlay of the table has names that a reader can find, once each.
@@ -168,6 +181,10 @@ fn sections_of_this_computer_s_mcus_with_aliases() {
         assert!(printed.iter().any(|line| line.starts_with(&format!("{what} by ["))), "{what}: {printed:?}");
     }
     assert!(printed("[bme280]\ni2c_bus: i2c.1\n").is_empty(), "on the board");
+    // Options and variables that only sound like pins.
+    let alone = "[mcu]\nserial: /tmp/klipper_host_mcu\n[bltouch]\npin_move_time: 0.680\n[gcode_macro A]\nvariable_a_pin: gpio5\ngcode:\n  M117\n[fan]\npin: GPIO_GCLK\n";
+    let tree = pi4(&[("CONFIG/printer.cfg", alone)]);
+    assert!(all(&tree).is_empty() && uses(&tree).no_lines.is_empty(), "{:?}", uses(&tree).no_lines);
 }
 
 #[test]
