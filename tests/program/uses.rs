@@ -3,7 +3,7 @@
 //! `pinion pins --used` shows. Also the cases of people whose setup `pinion add` once broke.
 
 use std::fs;
-use std::net::TcpListener;
+
 use std::os::unix::fs::symlink;
 use std::process::{Command, Output};
 
@@ -523,8 +523,6 @@ fn a_device_that_the_host_does_not_have_is_not_offered() {
 fn moonraker_is_asked_at_all_addresses_of_its_name() {
     let (address, server) = moonraker("standby");
     let port = address.rsplit(':').next().unwrap();
-    // Nobody answers on IPv6.
-    drop(TcpListener::bind("[::1]:0"));
     let card = Card::pi();
     let told = card.added(&["adxl345", "--yes", "--moonraker", &format!("localhost:{port}")]);
     assert!(told.contains("1.00 of gravity"), "{told}");

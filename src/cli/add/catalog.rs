@@ -347,7 +347,7 @@ mod tests {
                 }
                 // Every device can be added to a Raspberry Pi 4.
                 let uses = Uses::find(&Tree::new().computer(), Some(&boards[1]), None, None);
-                let search = Search { board: &boards[1], uses: &uses, own: None };
+                let search = Search { board: &boards[1], uses: &uses, own: None, there: None };
                 let spot = search.spots(way).remove(0);
                 assert_eq!(search.conflict(way, &spot), None, "{}", device.name);
                 let wires = search.wires(device, way, &spot, &BTreeMap::new(), None).unwrap();
@@ -465,7 +465,7 @@ mod tests {
             let head = "[mcu host]\nserial: /tmp/klipper_host_mcu\n";
             tree.put("home/pi/printer_data/config/printer.cfg", format!("{head}{config}"));
             let uses = Uses::find(&tree.computer(), Some(board), None, None);
-            let search = Search { board, uses: &uses, own: None };
+            let search = Search { board, uses: &uses, own: None, there: None };
             let way = &catalog.device(device).unwrap().way[0];
             let mut why = String::new();
             for spot in search.spots(way) {
@@ -510,6 +510,24 @@ mod tests {
         }
     }
 
+    /// A section of the user's own is asked at its own address.
+    #[test]
+    fn the_addresses_of_other_chips_are_not_asked() {
+        let catalog = Catalog::read().unwrap();
+        let boards = board::all().unwrap();
+        let tree = Tree::new();
+        tree.put(
+            "home/pi/printer_data/config/printer.cfg",
+            "[mcu host]\nserial: /tmp/klipper_host_mcu\n[temperature_sensor room]\nsensor_type: BME280\ni2c_mcu: host\ni2c_bus: i2c.1\ni2c_address: 118\n",
+        );
+        let uses = Uses::find(&tree.computer(), Some(&boards[1]), None, None);
+        let way = &catalog.device("bme280").unwrap().way[0];
+        for (there, addresses) in [(None, &[0x77][..]), (Some("temperature_sensor room"), &[0x76, 0x77])] {
+            let search = Search { board: &boards[1], uses: &uses, own: None, there: there.map(str::to_owned) };
+            assert_eq!(search.addresses(way, &search.spots(way)[0]), addresses);
+        }
+    }
+
     #[test]
     fn a_line_is_one_that_nothing_uses() {
         let catalog = Catalog::read().unwrap();
@@ -522,7 +540,7 @@ mod tests {
             let config = format!("[mcu host]\nserial: /tmp/klipper_host_mcu\n{}", pins.collect::<String>());
             tree.put("home/pi/printer_data/config/printer.cfg", config);
             let uses = Uses::find(&tree.computer(), Some(board), None, None);
-            let search = Search { board, uses: &uses, own: None };
+            let search = Search { board, uses: &uses, own: None, there: None };
             let wires = search.wires(relay, &relay.way[0], &Spot::default(), &BTreeMap::new(), wanted);
             wires.map(|wires| wires.last().unwrap().pin)
         };

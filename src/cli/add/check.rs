@@ -88,7 +88,7 @@ impl Work<'_> {
         let own = printer.map(|printer| printer.file(&self.device.file(self.name())));
         let others = printer.zip(own.as_deref()).map(|(printer, own)| printer.others(own));
         // A section that is there already keeps its thermometer.
-        let is_other = |section: &&Section| self.there.as_ref() != Some(&section.name);
+        let is_other = |section: &&Section| self.search.there.as_ref() != Some(&section.name);
         let known: BTreeSet<&str> =
             others.into_iter().flatten().filter(is_other).filter_map(|section| section.text("serial_no")).collect();
         let found = self.computer.matching("/sys/bus/w1/devices/28-*");

@@ -178,10 +178,10 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
     }
     let ways = ways(&board, device, args.bus.as_deref())?;
     let own = target.as_ref().ok().map(|target| target.file(&device.file(args.name.as_deref())));
-    let search = Search { board: &board, uses: &uses, own: own.as_deref() };
     let there = target.as_ref().ok().map(|target| existing(target, device, args)).transpose()?.flatten();
-    let (way, spot) = place(&search, device, &ways, args, there.as_deref(), report)?;
-    let mut work = Work { args, computer, catalog: &catalog, board: &board, device, way, spot, search, there, report };
+    let search = Search { board: &board, uses: &uses, own: own.as_deref(), there };
+    let (way, spot) = place(&search, device, &ways, args, report)?;
+    let mut work = Work { args, computer, catalog: &catalog, board: &board, device, way, spot, search, report };
     work.run(target)
 }
 
@@ -238,20 +238,19 @@ fn ways<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result<V
 /// The page about pins, in the package.
 const PINS: &str = "/usr/share/doc/pinion-mcu/guide/pins.md";
 
-/// The way and the place of a device: those of an earlier call, or of a section that is `there`, or the first ones that are
+/// The way and the place of a device: those of an earlier call, or of a section that is there, or the first ones that are
 /// free.
 fn place<'a>(
     search: &Search,
     device: &Device,
     ways: &[&'a Way],
     args: &AddArgs,
-    there: Option<&str>,
     report: &mut Report,
 ) -> Result<(&'a Way, Spot), String> {
     let all = |ways: &[&'a Way]| -> Vec<(&'a Way, Spot)> {
         ways.iter().flat_map(|way| search.spots(way).into_iter().map(|spot| (*way, spot))).collect()
     };
-    let section = there.map(|name| format!("[{name}]"));
+    let section = search.there.as_ref().map(|name| format!("[{name}]"));
     let is_placed = |(way, spot): &(&Way, Spot)| {
         let mut own = search.uses.all.iter().filter(|one| match &section {
             Some(section) => one.user == *section && matches!(one.source, Source::Printer(_)),
@@ -437,8 +436,6 @@ struct Work<'a> {
     /// The place on the bus.
     spot: Spot,
     search: Search<'a>,
-    /// A section of the user's own for it. Then only its bus is enabled.
-    there: Option<String>,
     report: &'a mut Report,
 }
 
@@ -449,14 +446,14 @@ impl Work<'_> {
 
     /// Its section of printer.cfg.
     fn section(&self) -> String {
-        self.there.clone().unwrap_or_else(|| self.device.section(self.name()))
+        self.search.there.clone().unwrap_or_else(|| self.device.section(self.name()))
     }
 
     /// Does it. Without a printer, all but its configuration.
     fn run(&mut self, target: Result<Target, String>) -> Result<(), String> {
         let written =
             target.as_ref().map(|target| target.written_pins(self.device, self.way, self.name())).unwrap_or_default();
-        let wires = match &self.there {
+        let wires = match &self.search.there {
             Some(_) => self.search.wires(self.device, self.way, &self.spot, &written, None)?,
             None => self.search.wires(self.device, self.way, &self.spot, &written, self.args.pin.as_deref())?,
         };
@@ -566,7 +563,7 @@ impl Work<'_> {
             ));
         }
         let mut is_changed = false;
-        if let Some(section) = &self.there {
+        if let Some(section) = &self.search.there {
             let place = target.config().section(section).map_or(String::new(), |section| section.place.to_string());
             self.report.line(format_args!(
                 "[{section}] is in printer.cfg already ({place}), and stays as it is. For a second one: {} --name NAME",
@@ -586,7 +583,7 @@ impl Work<'_> {
             self.report.line("Nothing is left to change.");
         }
         if let Some(moonraker) = moonraker {
-            let is_own = self.there.is_none();
+            let is_own = self.search.there.is_none();
             let undo = format!("{} takes it back", command(self.args, true));
             self.measure(moonraker, is_changed).map_err(|why| if is_own { format!("{why}: {undo}") } else { why })?;
         }

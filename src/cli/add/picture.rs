@@ -122,7 +122,7 @@ mod tests {
         let computer = tree.computer();
         let board = Board::of(&computer, None).unwrap().unwrap();
         let uses = Uses::find(&computer, Some(&board), None, None);
-        let search = Search { board: &board, uses: &uses, own: None };
+        let search = Search { board: &board, uses: &uses, own: None, there: None };
         let device = catalog.device("adxl345").unwrap();
         let way = &device.way[0];
         let wires = search.wires(device, way, &search.spots(way)[0], &BTreeMap::new(), None).unwrap();

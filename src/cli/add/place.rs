@@ -28,6 +28,8 @@ pub(super) struct Search<'a> {
     pub(super) uses: &'a Uses,
     /// The device's own file. What it uses is the device's.
     pub(super) own: Option<&'a Path>,
+    /// The user's own section for the device, which is the device, too.
+    pub(super) there: Option<String>,
 }
 
 /// The lines of config.txt that a way needs at this place.
@@ -54,8 +56,9 @@ impl Search<'_> {
                 lines.iter().filter_map(|line| line.strip_prefix("dtoverlay=")).any(|wanted| is_of(loaded, wanted))
             })
         };
-        self.own.is_some_and(|own| Target::is_use_of(one, own))
-            || self.own.is_some() && one.source == Source::Boot && is_overlay()
+        let is_section = self.there.as_ref().is_some_and(|section| one.user == format!("[{section}]"));
+        let is_file = self.own.is_some_and(|own| Target::is_use_of(one, own));
+        is_section || is_file || self.own.is_some() && one.source == Source::Boot && is_overlay()
     }
 
     /// The places for a device that is connected in this way, the best one first. PWM and 1-Wire are where the boot loader
