@@ -12,9 +12,10 @@ use crate::cli::computer::{Access, Computer};
 use crate::cli::quietly;
 
 use super::catalog::Check;
+use super::command;
 use super::printer::Target;
 use super::probe::{self, Answer};
-use super::{Work, command};
+use super::work::Work;
 
 /// How often a chip's driver is asked for a value.
 const SAMPLES: usize = 8;

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::Work;
 use super::moonraker::{Host, Moonraker};
+use super::work::Work;
 
 /// How long a fan may take until its tachometer counts. klippy reports a speed each second.
 const SPIN_UP: Duration = Duration::from_secs(6);

@@ -4,10 +4,10 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::Work;
 use super::boot;
 use super::place::config_lines;
 use super::side::{Edit, Side};
+use super::work::Work;
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Boot, Kind};
 use crate::cli::computer::uses::boot::lines;
