@@ -88,7 +88,7 @@ fn from_nothing_to_a_measured_resonance_and_back() {
     let before = fs::read(&printer_cfg).unwrap();
     let pinion = |more: &[&str]| -> Value {
         let output = Command::new(pinion_path())
-            .args(["add", "adxl345", "--yes", "--json", "--config", "/printer.cfg", "--root"])
+            .args(["add", "adxl345", "--yes", "--json", "--config", "/printer.cfg", "--mcu", "mcu", "--root"])
             .arg(&root)
             .args(["--moonraker", &moonraker.address])
             .args(more)

@@ -74,7 +74,7 @@ pub(super) struct AddArgs {
     /// The host's configuration [default: that of the only klippy]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
-    /// This computer's MCU in the configuration, if there are several
+    /// This computer's MCU in the configuration, if its link does not say so
     #[arg(long, value_name = "NAME", value_hint = ValueHint::Other)]
     mcu: Option<String>,
     /// Where Moonraker answers [default: as moonraker.conf beside the configuration says]
@@ -127,7 +127,7 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
     let model = board::model(computer);
     report.set("model", json!(model));
     report.set("board", json!(board.as_ref().map(|board| &board.name)));
-    let target = Target::find(computer, args.config.as_deref());
+    let target = Target::find(computer, args.config.as_deref(), args.mcu.as_deref());
     let lacks = |device: &Device| {
         let klippy = target.as_ref().ok()?.klippy(computer)?;
         printer::lacks(&klippy, device.module())
@@ -160,7 +160,7 @@ fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(),
         return Err(why.clone());
     }
     let inventory = computer.is_this().then(Inventory::scan);
-    let config = target.as_ref().ok().map(|target| target.path.as_path());
+    let config = target.as_ref().ok().map(|target| (target.path.as_path(), args.mcu.as_deref()));
     let uses = Uses::find(computer, board.as_ref(), config, inventory.as_ref());
     if args.undo {
         return undo::undo(args, computer, &catalog, device, target, &uses, report);
@@ -365,10 +365,10 @@ fn command(args: &AddArgs, undo: bool) -> String {
         words.extend(value.map(|value| format!("--{name} {}", word(value))));
     };
     option("name", args.name.clone());
+    option("mcu", args.mcu.clone());
     if !undo {
         option("bus", args.bus.clone());
         option("pin", args.pin.clone());
-        option("mcu", args.mcu.clone());
     }
     let path = |path: &PathBuf| path.display().to_string();
     option("config", args.config.as_ref().map(path));

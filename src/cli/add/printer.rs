@@ -99,7 +99,7 @@ impl Target {
     /// # Errors
     ///
     /// One line: there is none, there are several, it cannot be read, is a link, or has a line that klippy refuses.
-    pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<Target, String> {
+    pub(super) fn find(computer: &Computer, named: Option<&Path>, mcu: Option<&str>) -> Result<Target, String> {
         let file = find(computer, named)?;
         let path = named.and_then(|_| link_to(computer, &file)).unwrap_or_else(|| file.clone());
         let folder = computer.resolve(file.parent().unwrap_or(Path::new("/"))).map_err(|error| error.to_string())?;
@@ -114,7 +114,7 @@ impl Target {
         let text = side.read(&file)?.unwrap_or_default();
         let _rights = side.rights().map_err(|error| error.to_string())?;
         let printer = Printer::read(computer, &path).map_err(|trouble| trouble.to_string())?;
-        let mcus = printer.own_mcus(computer);
+        let mcus = printer.own_mcus(computer, mcu);
         Ok(Target { path, file, owner, text, printer, mcus })
     }
 
@@ -487,7 +487,7 @@ mod tests {
         for (name, text) in files {
             tree.put(&format!("home/pi/printer_data/config/{name}"), text);
         }
-        let target = Target::find(&tree.computer(), None).unwrap();
+        let target = Target::find(&tree.computer(), None, None).unwrap();
         assert_eq!(target.path, Path::new(CONFIG));
         (tree, target)
     }
@@ -557,7 +557,9 @@ mod tests {
         assert_eq!(mcu(&format!("{bed}{own}")), Ok(("zz".into(), false)));
         assert_eq!(mcu("[mcu host]\nserial: /dev/serial/by-id/usb-pico\n"), Ok(("host2".into(), true)));
         assert_eq!(mcu("[mcu host]\ncanbus_uuid: 1\n[mcu host2]\nserial: /dev/x\n"), Ok(("host3".into(), true)));
-        let (_tree, target) = read(&[("printer.cfg", own)]);
+        let (tree, target) = read(&[("printer.cfg", &format!("{bed}[mcu x]\nserial: /dev/x\n"))]);
+        let named = Target::find(&tree.computer(), None, Some("bedpi")).unwrap();
+        assert_eq!(named.mcu(Some("bedpi")).unwrap().0, "bedpi", "the user knows better");
         assert!(target.mcu(Some("x")).unwrap_err().starts_with("--mcu: \"x\" is not an MCU of this computer"));
     }
 
@@ -588,10 +590,10 @@ mod tests {
         tree.put("home/pi/printer_data/config/other.cfg", "[adxl345]\n");
         tree.link("home/pi/printer_data/config/printer.cfg", "../../dotfiles/printer.cfg");
         let computer = tree.computer();
-        let error = Target::find(&computer, Some(Path::new(CONFIG))).err().unwrap();
+        let error = Target::find(&computer, Some(Path::new(CONFIG)), None).err().unwrap();
         let file = "/home/pi/dotfiles/printer.cfg";
         assert!(error.ends_with(&format!("--config {file}")), "{error}");
-        let target = Target::find(&computer, Some(Path::new(file))).unwrap();
+        let target = Target::find(&computer, Some(Path::new(file)), None).unwrap();
         assert!(target.config().section("adxl345").is_some());
         let names: Vec<String> = plan(&tree, &target, "relay").into_iter().map(|(name, _)| name).collect();
         assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/relay.cfg", "dotfiles/printer.cfg"]);
@@ -606,7 +608,7 @@ mod tests {
         assert!(find(&tree.computer(), None).unwrap_err().contains("several hosts"));
         tree.put("etc/shadow", "x");
         tree.link("home/c/printer.cfg", "../../etc/shadow");
-        let error = Target::find(&tree.computer(), Some(Path::new("/home/c/printer.cfg"))).err().unwrap();
+        let error = Target::find(&tree.computer(), Some(Path::new("/home/c/printer.cfg")), None).err().unwrap();
         assert!(error.ends_with("it is a link: name the file that it leads to: --config /etc/shadow"), "{error}");
         // A file that includes itself, or everything.
         let path = Path::new("/home/a/printer_data/config/printer.cfg");
@@ -615,7 +617,7 @@ mod tests {
             ("[a]\nno value\n", "printer.cfg:2: Source contains parsing errors"),
         ] {
             tree.put("home/a/printer_data/config/printer.cfg", text);
-            let error = Target::find(&tree.computer(), Some(path)).err().unwrap();
+            let error = Target::find(&tree.computer(), Some(path), None).err().unwrap();
             assert!(error.contains(refusal), "{error}");
         }
     }
@@ -630,7 +632,8 @@ mod tests {
         tree.put("home/pi/printer_2_data/config/printer.cfg", "");
         assert!(address(&target).unwrap_err().contains("--moonraker ADDRESS"));
         tree.put("home/pi/printer_2_data/config/moonraker.conf", "[server]\nhost: 0.0.0.0\nport: 7126\n");
-        let second = Target::find(&computer, Some(Path::new("/home/pi/printer_2_data/config/printer.cfg"))).unwrap();
+        let second =
+            Target::find(&computer, Some(Path::new("/home/pi/printer_2_data/config/printer.cfg")), None).unwrap();
         assert_eq!(address(&second), Ok("127.0.0.1:7126".into()));
         tree.put("home/pi/printer_2_data/config/moonraker.conf", "[server]\nhost: ::1\n");
         assert_eq!(address(&second), Ok("[::1]:7125".into()));

@@ -95,14 +95,17 @@ impl Printer {
     }
 
     /// The MCUs that are this computer's own, with their links. Another computer's MCU (`pinion link`) and a simulated
-    /// one have links of the same kind. So a link counts if it is the usual one, or if a Pinion serves it here.
-    pub(in crate::cli) fn own_mcus(&self, computer: &Computer) -> BTreeMap<String, PathBuf> {
+    /// one have links of the same kind. So a link counts if it is the usual one, if a Pinion serves it here, or if the
+    /// user has `named` its MCU.
+    pub(in crate::cli) fn own_mcus(&self, computer: &Computer, named: Option<&str>) -> BTreeMap<String, PathBuf> {
         // A file may name many, and the processes are looked at once.
         let running = OnceCell::new();
         let running = || running.get_or_init(|| computer.running()).as_slice();
         let mcus = self.config.of_kind("mcu").filter_map(|section| {
             let name = section.name.strip_prefix("mcu ").map_or("mcu", str::trim);
-            let serial = section.text("serial").filter(|serial| is_served(computer, &running, serial))?;
+            let serial = section.text("serial").filter(|serial| {
+                named == Some(name) && serial.starts_with(HOST_PATHS) || is_served(computer, &running, serial)
+            })?;
             Some((name.to_owned(), PathBuf::from(serial)))
         });
         mcus.collect()
@@ -180,7 +183,7 @@ pub fn printer_cfg(bytes: &[u8]) {
     let computer = Computer::at(&folder);
     if let Ok(printer) = Printer::read(&computer, Path::new("/printer.cfg")) {
         assert!(printer.spi_leds().iter().all(|pin| pin.contains("spidev")));
-        let (numbered, own) = (printer.numbered(), printer.own_mcus(&computer));
+        let (numbered, own) = (printer.numbered(), printer.own_mcus(&computer, None));
         assert!(numbered.iter().all(|(_, pin)| line_of(pin).is_some()) && own.len() <= printer.serials().len());
     }
 }

@@ -98,7 +98,7 @@ pub(super) fn slow_buses(computer: &Computer, klippys: &[Klippy]) -> Vec<Finding
     const CHECK: &str = "i2c_clock";
     let mut findings = Vec::new();
     for printer in klippys.iter().filter_map(Klippy::printer) {
-        let own = printer.own_mcus(computer);
+        let own = printer.own_mcus(computer, None);
         for section in printer.config.sections().iter().filter(|section| ACCELEROMETERS.contains(&section.kind())) {
             let number = section.text("i2c_bus").and_then(|bus| bus.strip_prefix("i2c.")?.parse::<u32>().ok());
             let Some(number) = number.filter(|_| own.contains_key(section.text("i2c_mcu").unwrap_or("mcu"))) else {

@@ -112,11 +112,12 @@ pub(in crate::cli) struct Uses {
 }
 
 impl Uses {
-    /// Finds all users. `also` is a configuration that no klippy names. The kernel's lines are those of `inventory`.
+    /// Finds all users. `also` is a configuration that klippy may not name, with the MCU in it that the user calls this
+    /// computer's. The kernel's lines are those of `inventory`.
     pub(in crate::cli) fn find(
         computer: &Computer,
         board: Option<&Board>,
-        also: Option<&Path>,
+        also: Option<(&Path, Option<&str>)>,
         inventory: Option<&Inventory>,
     ) -> Uses {
         let names = Names::of(computer, board, inventory);
@@ -132,10 +133,11 @@ impl Uses {
             uses.add_boot(computer, board);
         }
         let mut configs = printer::configs(computer);
-        configs.extend(also.map(Path::to_owned));
+        configs.extend(also.map(|(path, _)| path.to_owned()));
         for path in &configs {
             if let Ok(printer) = Printer::read(computer, path) {
-                uses.add_printer(computer, path, &printer);
+                let named = also.filter(|(also, _)| also == path).and_then(|(_, mcu)| mcu);
+                uses.add_printer(computer, path, &printer, named);
             }
         }
         uses.add_services(computer, &configs);
@@ -150,8 +152,8 @@ impl Uses {
     }
 
     /// Adds what a configuration uses on this computer's MCUs.
-    fn add_printer(&mut self, computer: &Computer, path: &Path, printer: &Printer) {
-        let own = printer.own_mcus(computer);
+    fn add_printer(&mut self, computer: &Computer, path: &Path, printer: &Printer, named: Option<&str>) {
+        let own = printer.own_mcus(computer, named);
         let source = Source::Printer(path.to_owned());
         self.mcus.extend(own.keys().next().map(|name| (path.to_owned(), name.clone())));
         for section in printer.config.sections() {
