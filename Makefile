@@ -128,7 +128,9 @@ test-all: check test test-slow test-kernel figures
 	@$(MAKE) --no-print-directory klippy
 
 test-slow:
-	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::
+	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::cut::
+	@# In real time, so that it would delay the others.
+	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::demonstration:: --test-threads=1
 
 klippy:
 	@if [ -n "$$KLIPPER_DIR" ]; then '$(CARGO)' test --locked --test klippy -- --test-threads=1; \

@@ -16,9 +16,10 @@ use crate::ssh::{attached, pair};
 use crate::status::{line, status};
 
 /// When the motors start, from the configuration on: a busy computer also has their steps queued by then.
-const START_S: f64 = 5.0;
-/// How long a heater stays on that the host does not refresh: until the motors have stopped.
-const HEAT_S: f64 = START_S + 4.0;
+const START_S: f64 = 2.0;
+/// How long a heater stays on that the host does not refresh: until the motors have stopped, and not until a silent host
+/// counts as gone, which takes 5 seconds.
+const HEAT_S: f64 = START_S + 2.0;
 /// The move that the host has queued: 150 steps, 10 ms apart.
 const STEPS: u32 = 150;
 const STEP_S: f64 = 0.01;
@@ -228,7 +229,7 @@ fn an_ssh_that_carries_nothing_any_more() {
 fn a_host_that_hangs_behind_ssh_is_no_cut() {
     let (mcu, _near, mut host) = over_ssh();
     // `pinion link` sends a keepalive after two seconds of silence.
-    begin(&mut host, HEAT_S);
+    begin(&mut host, 2.0 * HEAT_S);
     mcu.logged("shutdown: Missed scheduling of next digital out event");
     let verdict = mcu.logged("the host sent no commands for");
     assert!(verdict.contains("but its computer sent keepalives"), "{verdict}");
