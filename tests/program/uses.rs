@@ -146,7 +146,7 @@ fn a_bus_that_something_uses_is_avoided() {
     let card = Card::pi().with_config_txt("dtoverlay=somebodys-hat\n");
     let told = card.added(&["relay", "--dry-run"]);
     assert!(
-        told.contains("/boot/firmware/config.txt:52 loads the overlay somebodys-hat. Pinion does not know which pins"),
+        told.contains("/boot/firmware/config.txt:52: Pinion does not know which pins the overlay somebodys-hat takes"),
         "{told}"
     );
 }

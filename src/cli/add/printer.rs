@@ -411,7 +411,7 @@ impl Target {
             .config()
             .sections()
             .iter()
-            .filter(|section| self.is_in(section, &file))
+            .filter(|section| goes(&file) && self.is_in(section, &file))
             .map(|section| section.name.as_str())
             .collect();
         let mut printer_cfg = self.config().without_saved(&self.text, &saved);

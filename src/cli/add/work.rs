@@ -121,7 +121,7 @@ impl Work<'_> {
         self.report.line(format_args!("  mind:  {}", device.trap));
         for one in self.search.uses.unknown() {
             self.report.line(format_args!(
-                "  mind:  {} loads the {}. Pinion does not know which pins that takes: compare them with these wires",
+                "  mind:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
                 one.place, one.user
             ));
         }

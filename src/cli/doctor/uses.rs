@@ -9,7 +9,7 @@ use crate::cli::computer::Computer;
 use crate::cli::computer::board::{append, is_pi};
 use crate::cli::computer::klippy::Klippy;
 use crate::cli::computer::printer::Printer;
-use crate::cli::computer::uses::{Resource, Source, Use, Uses};
+use crate::cli::computer::uses::{A_PROGRAM, Resource, Source, Use, Uses};
 use crate::cli::finding::Finding;
 use pinion_linux::foreign::word;
 
@@ -29,8 +29,10 @@ pub(super) fn conflicts(uses: &Uses) -> Vec<Finding> {
             let is_same =
                 other.what == one.what || takes_all(&other.what, &one.what) || takes_all(&one.what, &other.what);
             let is_bus = one.function.is_some() && one.function == other.function;
+            // The program that has exported a channel may be Pinion, for this section.
+            let is_export = matches!(other.what, Resource::Pwm(_)) && other.user == A_PROGRAM;
             // klippy itself says if a printer.cfg uses a pin twice.
-            is_same && !is_bus && other.source != one.source
+            is_same && !is_bus && !is_export && other.source != one.source
         };
         for other in uses.all.iter().filter(rival) {
             let mut pair = [(&one.user, &one.place), (&other.user, &other.place)];

@@ -23,6 +23,8 @@ mod services;
 
 pub(in crate::cli) use lines::Names;
 
+/// The user of a PWM channel that a program has exported.
+pub(in crate::cli) const A_PROGRAM: &str = "a program";
 /// Highest number of uses. A hostile file could name many.
 const USES_MAX: usize = 4_000;
 
@@ -45,7 +47,7 @@ pub(in crate::cli) enum Resource {
     Sensor(String),
     /// Another device in /dev, such as a camera.
     Device(String),
-    /// Anything: nobody knows what this overlay takes.
+    /// Anything: nobody knows what this overlay or this configuration takes.
     Unknown(String),
 }
 
@@ -132,17 +134,31 @@ impl Uses {
         if let Some(board) = board {
             uses.add_boot(computer, board);
         }
-        let mut configs = printer::configs(computer);
-        configs.extend(also.map(|(path, _)| path.to_owned()));
-        for path in &configs {
-            if let Ok(printer) = Printer::read(computer, path) {
-                let named = also.filter(|(also, _)| also == path).and_then(|(_, mcu)| mcu);
-                uses.add_printer(computer, path, &printer, named);
-            }
+        // The number of uses is limited, so those that count most come first.
+        if let Some((path, mcu)) = also {
+            uses.add_host(computer, path, mcu);
         }
-        uses.add_services(computer, &configs);
         uses.add_kernel(computer, inventory);
+        for path in printer::configs(computer).iter().filter(|path| also.is_none_or(|(also, _)| also != *path)) {
+            uses.add_host(computer, path, None);
+        }
+        uses.add_other_services(computer);
         uses
+    }
+
+    /// Adds a klippy's configuration, and those of the services beside it.
+    fn add_host(&mut self, computer: &Computer, path: &Path, mcu: Option<&str>) {
+        match Printer::read(computer, path) {
+            Ok(printer) => self.add_printer(computer, path, &printer, mcu),
+            Err(_) => self.add(Use {
+                what: Resource::Unknown(path.display().to_string()),
+                user: "unreadable configuration".to_owned(),
+                place: path.display().to_string(),
+                source: Source::Printer(path.to_owned()),
+                function: None,
+            }),
+        }
+        self.add_services(computer, path.parent().unwrap_or(Path::new("/")));
     }
 
     fn add(&mut self, one: Use) {
@@ -308,7 +324,7 @@ impl Uses {
                 let is_printer_s = self.all.iter().any(|one| one.what == Resource::Pwm(name.clone()));
                 let user = match &channel.consumer {
                     Some(consumer) if consumer != "sysfs" => format!("driver {consumer}"),
-                    _ if channel.exported && !is_printer_s => "a program".to_owned(),
+                    _ if channel.exported && !is_printer_s => A_PROGRAM.to_owned(),
                     _ => continue,
                 };
                 self.add(one(Resource::Pwm(name), user, format!("/sys/class/pwm/pwmchip{}", chip.number), None));
@@ -346,7 +362,7 @@ impl Uses {
         self.all.iter().filter(move |one| one.what == *what)
     }
 
-    /// The overlays of which nobody knows what they take.
+    /// The overlays and configurations of which nobody knows what they take.
     pub(in crate::cli) fn unknown(&self) -> impl Iterator<Item = &Use> {
         self.all.iter().filter(|one| matches!(one.what, Resource::Unknown(_)))
     }

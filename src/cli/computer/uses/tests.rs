@@ -310,6 +310,35 @@ fn hostile_files_end_at_once() {
     assert!(!format!("{:?}", all(&tree)).contains("secret"));
 }
 
+/// Nobody knows what a configuration uses that cannot be read.
+#[test]
+fn a_configuration_with_a_mistake_may_use_anything() {
+    let tree = pi4(&[("home/b/printer_data/config/printer.cfg", "no section\n")]);
+    let told = "anything by unreadable configuration at /home/b/printer_data/config/printer.cfg";
+    assert_eq!(all(&tree), [told]);
+}
+
+/// Somebody else's file cannot push the user's own out of the picture.
+#[test]
+fn the_uses_of_the_printer_itself_come_first() {
+    let many: Vec<String> = (0..2 * USES_MAX).map(|n| format!("host:gpiochip9/gpio{n}")).collect();
+    let many = format!("[multi_pin x]\npins: {}\n", many.join(", "));
+    let head = "[mcu host]\nserial: /tmp/klipper_host_mcu\n";
+    let tree = pi4(&[
+        ("home/a/printer_data/config/printer.cfg", &format!("{head}{many}")),
+        ("CONFIG/printer.cfg", &format!("{head}[output_pin heater]\npin: host:GPIO17\n")),
+        ("CONFIG/moonraker.conf", "[power psu]\npin: gpio27\n"),
+    ]);
+    let computer = tree.computer();
+    let board = Board::of(&computer, None).unwrap();
+    let own = format!("/{CONFIG}/printer.cfg");
+    let uses = Uses::find(&computer, board.as_ref(), Some((Path::new(&own), None)), None);
+    assert_eq!(uses.all.len(), USES_MAX);
+    for line in ["GPIO17", "GPIO27"] {
+        assert_eq!(uses.of(&Resource::Line(line.into())).count(), 1, "{line}");
+    }
+}
+
 /// An absolute link of a card leads to the card's file.
 #[test]
 fn links_stay_below_the_root() {
