@@ -2,6 +2,8 @@
 # stand-in for Moonraker and klippy.
 pinion add | grep 'so its board is not known'
 mkdir /run/add
+# The pages that its messages name are there.
+test -s /usr/share/doc/pinion-mcu/guide/pins.md
 not pinion add adxl345 --yes 2>/run/add/refused
 grep 'look up in its manual which pins have SPI' /run/add/refused
 
