@@ -31,3 +31,4 @@ mod terminal;
 mod toolpath;
 mod trace;
 mod troubleshooting;
+mod uses;
