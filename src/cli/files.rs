@@ -277,7 +277,7 @@ mod tests {
         File::create(&path).unwrap().set_len(2 * MIB).unwrap();
         assert_eq!(read(&path, 2).unwrap().len() as u64, 2 * MIB);
         assert_eq!(read(&path, 1).unwrap_err().to_string(), "it is longer than 1 MiB");
-        assert_eq!(read(Path::new("/dev/zero"), 1).unwrap_err().to_string(), "it is no regular file");
+        assert_eq!(read(Path::new("/dev/zero"), 1).unwrap_err().to_string(), "it is not a regular file");
         for path in ["/dev/null", "/nonexistent/a", "/"] {
             let error = Output::check(Path::new(path), &[]).map(drop).unwrap_err();
             assert!(error.starts_with(&format!("{path} cannot be written: ")), "{error}");
