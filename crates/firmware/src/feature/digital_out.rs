@@ -12,6 +12,8 @@ use crate::time::{Clock, Ticks};
 use super::{changes_too_late, not_refreshed, set_too_late};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "output pins",
+
     commands: &[CONFIG_DIGITAL_OUT, SET_DIGITAL_OUT_PWM_CYCLE, QUEUE_DIGITAL_OUT, UPDATE_DIGITAL_OUT, SET_DIGITAL_OUT],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY

@@ -6,15 +6,18 @@
 //! reported as soon as it arrives. Klipper's C reports it when the next one is due.
 
 use crate::board::Thermometer;
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DialectName::Kalico, Dialects, Feature, Finished, Job, JobSlot, Next, Object,
-    Oid, Response, Timer, WireClock, command, response, since,
+    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock,
+    command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 use crate::trouble::Trouble;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "DS18B20 sensors",
+
     commands: &[CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
     responses: &[Reading::FORM],
     shutdowns: SHUTDOWNS,
@@ -179,15 +182,16 @@ const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
     |context, oid: Oid, serial: &[u8], max_error_count: u8| configure(context, oid, serial, max_error_count, false)
 )
-.of(Dialects::ALL.except(Kalico));
+.of(&[V0_11, V0_12, V0_13, Master]);
 
-const CONFIG_DS18B20_OF_KALICO: Command = command!(
+/// Hosts with this form also ignore the limits of other sensors.
+pub(super) const CONFIG_DS18B20_OF_KALICO: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c ignore_limits=%c",
     |context, oid: Oid, serial: &[u8], max_error_count: u8, ignore_limits: bool| {
         configure(context, oid, serial, max_error_count, ignore_limits)
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",

@@ -10,9 +10,9 @@
 //! too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
 use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DeviceWarning, DialectName::Kalico, DialectName::Master, DialectName::V0_13,
-    Feature, Finished, Job, JobSlot, Oid, Remote, Settable, command, since,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Oid, Remote, Settable, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::Ticks;
@@ -25,6 +25,8 @@ mod lines;
 mod spi;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "HX711 and HX717 load cells",
+
     commands: &[
         CONFIG_HX71X,
         HX71X_ATTACH_TRIGGER_ANALOG,
@@ -241,30 +243,31 @@ const CONFIG_HX71X: Command = command!(
         configure(context, oid, gain_channel, dout_pin, sclk_pin)
     }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const HX71X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
     |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
     |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_HX71X: Command =
     command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
+const QUERY_HX71X_STATUS: Command = command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor
+    .query_status(context))
+.of(&[V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -8,19 +8,21 @@
 
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_11,
-    DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Object, Oid, Response,
-    command, only, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Object, Oid, Response,
+    command, response,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "I2C devices",
+
     commands: &[
-        CONFIG_I2C,
         CONFIG_I2C_WITH_BUS,
+        CONFIG_I2C,
         I2C_SET_BUS,
         I2C_SET_SOFTWARE_BUS,
         I2C_SET_SW_BUS,
@@ -32,7 +34,7 @@ pub(super) const FEATURE: Feature = Feature {
     responses: &[ReadResponse::FORM, TransferResponse::FORM],
     enumerations: &[
         Enumeration::new("i2c_bus", |board| board.i2c_buses()),
-        Enumeration::new("i2c_bus_status", |_| statuses()).of(since(Master)),
+        Enumeration::new("i2c_bus_status", |_| statuses()).of(&[Master]),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -57,15 +59,18 @@ shutdowns! {
     ODD_BITS = "i2c_modify_bits: Odd number of bits!";
 }
 
+/// The hosts whose messages have no status. Newer ones also look these messages up, and prefer them.
+const STOPS_ON_FAILURE: Hosts = Hosts::of(&[V0_11, V0_12, V0_13, Kalico]).unless(I2C_TRANSFER.format);
+
 response! {
     /// The bytes that a device sent.
-    "i2c_read_response oid=%c response=%*s" => until(V0_13).and(Kalico);
+    "i2c_read_response oid=%c response=%*s" => STOPS_ON_FAILURE;
     pub(super) struct ReadResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
 response! {
     /// The status of the bus, and the bytes that a device sent.
-    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => since(Master);
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => Hosts::of(&[Master]);
     pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
 }
 
@@ -92,7 +97,7 @@ fn statuses() -> Vec<Range> {
 
 /// The shutdown for a sensor that cannot be reached (Klipper's `i2c_shutdown_on_err`).
 pub(super) fn i2c_shutdown(context: &Context, error: BusError) -> Shutdown {
-    let reason = if context.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
+    let reason = if context.takes(&I2C_MODIFY_BITS) { I2C_READ_FAILED } else { on_wire(error.status).1 };
     Shutdown::because(reason, error.trouble)
 }
 
@@ -231,7 +236,7 @@ impl I2c {
     /// The shutdown for a failed transfer, depending on whether it was writing or reading.
     fn failure(&self, context: &Context, writing: bool, error: BusError) -> Shutdown {
         match writing {
-            _ if !context.serves(until(V0_12)) => i2c_shutdown(context, error),
+            _ if !context.takes(&I2C_MODIFY_BITS) => i2c_shutdown(context, error),
             _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.trouble),
             true => Shutdown::because(I2C_WRITE_FAILED, error.trouble),
             false => i2c_shutdown(context, error),
@@ -269,7 +274,7 @@ impl Object for I2c {
         }
         // v0.11 wrote the register in a transfer of its own before the read.
         let of_register =
-            context.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
+            context.takes(&CONFIG_I2C_WITH_BUS) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
         let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
         let failure = self.failure(context, writing, error);
         context.device_failed(self.kind(), failure)
@@ -280,8 +285,8 @@ impl Object for I2c {
     }
 }
 
-const CONFIG_I2C: Command =
-    command!("config_i2c oid=%c", |context, oid: Oid| context.assign(oid, I2c::new())).of(since(V0_12));
+const CONFIG_I2C: Command = command!("config_i2c oid=%c", |context, oid: Oid| context.assign(oid, I2c::new()))
+    .of(&[V0_12, V0_13, Master, Kalico]);
 
 const CONFIG_I2C_WITH_BUS: Command = command!(
     "config_i2c oid=%c i2c_bus=%u rate=%u address=%u",
@@ -292,14 +297,14 @@ const CONFIG_I2C_WITH_BUS: Command = command!(
         context.assign(oid, i2c)
     }
 )
-.of(only(V0_11));
+.of(&[V0_11]);
 
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
     I2c,
     |i2c, context, i2c_bus: u32, rate: u32, address: u32| i2c.set_bus(context, i2c_bus, rate, address)
 )
-.of(since(V0_12));
+.of(&[V0_12, V0_13, Master, Kalico]);
 
 /// Half a period at 100 kHz. Klipper's C used this rate for every requested rate.
 const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
@@ -312,7 +317,7 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
         i2c.set_lines(context, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
     }
 )
-.of(since(V0_12).until(V0_13));
+.of(&[V0_12, V0_13]);
 
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
@@ -324,16 +329,16 @@ const I2C_SET_SW_BUS: Command = command!(
         address
     )
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", I2c, |i2c, context, data: &[u8]| i2c
     .transfer(context, Transfer::new(Purpose::Write, data, 0)))
-.of(until(V0_13).and(Kalico));
+.hosts(STOPS_ON_FAILURE);
 
 const I2C_READ: Command =
     command!("i2c_read oid=%c reg=%*s read_len=%u", I2c, |i2c, context, reg: &[u8], read_len: u32| i2c
         .transfer(context, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
-    .of(until(V0_13).and(Kalico));
+    .hosts(STOPS_ON_FAILURE);
 
 const I2C_MODIFY_BITS: Command = command!(
     "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
@@ -348,13 +353,13 @@ const I2C_MODIFY_BITS: Command = command!(
         i2c.transfer(context, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
     }
 )
-.of(until(V0_12));
+.of(&[V0_11, V0_12]);
 
 const I2C_TRANSFER: Command =
     command!("i2c_transfer oid=%c write=%*s read_len=%u", I2c, |i2c, context, write: &[u8], read_len: u32| {
         i2c.transfer(context, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 /// A count of bytes has one byte, as in Klipper's C.
 fn one_byte(count: u32) -> usize {

@@ -9,9 +9,10 @@
 use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Back, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Dialects, Enumeration,
-    Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only, response, since,
+    Back, Chip, Command, Context, DialectName, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid,
+    Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -23,6 +24,8 @@ use super::trigger_analog::Attached;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "LDC1612 eddy current probes",
+
     commands: &[
         CONFIG_LDC1612,
         CONFIG_LDC1612_WITH_INTB,
@@ -40,17 +43,17 @@ pub(super) const FEATURE: Feature = Feature {
             ("INVALID_READ_DATA", INVALID_READ_DATA),
         ])
     })
-    .of(since(Master))],
+    .of(&[Master])],
     responses: &[HomeState::FORM],
     ..Feature::EMPTY
 };
 
 /// The hosts that home by the sensor itself. For them a failing bus stops the MCU.
-const HOMES_ITSELF: Dialects = only(V0_13).and(Kalico);
+const HOMES_ITSELF: &[DialectName] = &[V0_13, Kalico];
 
 response! {
     /// Whether samples are checked for homing, and when the trigger came.
-    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => HOMES_ITSELF;
+    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => Hosts::of(HOMES_ITSELF);
     pub(super) struct HomeState { oid: Oid, homing: bool, trigger_clock: Clock }
 }
 
@@ -217,7 +220,7 @@ impl Ldc1612 {
     fn note(failing: &mut bool, context: &mut Context, failure: Option<&BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(failing, failure.is_some());
         let Some(error) = failure else { return Ok(()) };
-        let stops = context.serves(HOMES_ITSELF);
+        let stops = context.speaks::<HomeState>();
         if failed_before && !stops {
             return Ok(());
         }
@@ -254,7 +257,7 @@ impl Ldc1612 {
     /// Processes a sample: both words of channel 0, or an error.
     fn add(&mut self, context: &mut Context, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
         let sample = match words {
-            Ok(words) if looks_like_an_error(words) && !context.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
+            Ok(words) if looks_like_an_error(words) && !context.speaks::<HomeState>() => Err(INVALID_READ_DATA),
             words => words,
         };
         let sample = match sample {
@@ -332,20 +335,20 @@ impl Object for Ldc1612 {
 const CONFIG_LDC1612: Command = command!("config_ldc1612 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
     Ldc1612::configure(context, oid, i2c_oid, None)
 })
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const CONFIG_LDC1612_WITH_INTB: Command = command!(
     "config_ldc1612_with_intb oid=%c i2c_oid=%c intb_pin=%c",
     |context, oid: Oid, i2c_oid: Oid, intb_pin: Pin| { Ldc1612::configure(context, oid, i2c_oid, Some(intb_pin)) }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const LDC1612_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Ldc1612,
     |sensor, context, trigger_analog_oid: Oid| sensor.attached.attach(context, trigger_analog_oid)
 )
-.of(since(Master));
+.of(&[Master]);
 
 const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
@@ -384,10 +387,11 @@ const QUERY_LDC1612: Command =
         let at = context.now() + rest_ticks;
         context.schedule(TIMER, at)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_STATUS_LDC1612: Command =
-    command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor.query_status(context)).of(since(V0_13));
+const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor
+    .query_status(context))
+.of(&[V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -16,6 +16,8 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "PCA9685 outputs",
+
     commands: &[CONFIG_PCA9685, QUEUE_PCA9685_OUT, SET_PCA9685_OUT],
     constants: &[Constant::number("PCA9685_MAX", VALUE_MAX as u32)],
     shutdowns: SHUTDOWNS,

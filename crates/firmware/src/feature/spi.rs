@@ -12,15 +12,18 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusError, ChipSelect, Pin, SpiConfig};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Enumeration,
-    Feature, Finished, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Job, JobSlot, Object, Oid, Response, Safe,
+    command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "SPI devices",
+
     commands: &[
         CONFIG_SPI,
         CONFIG_SPI_WITHOUT_CS,
@@ -346,7 +349,7 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
         spi.set_lines(context, pins, mode, pulse)
     }
 )
-.of(until(V0_13));
+.of(&[V0_11, V0_12, V0_13]);
 
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
@@ -358,7 +361,7 @@ const SPI_SET_SW_BUS: Command = command!(
         spi.set_lines(context, pins, mode, pulse_ticks)
     }
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const SPI_TRANSFER: Command =
     command!("spi_transfer oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, true, data));

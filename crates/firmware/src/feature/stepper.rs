@@ -5,9 +5,10 @@
 use std::ops::Range;
 
 use crate::board::Pin;
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Batch, Command, Constant, Context, DialectName::Kalico, DialectName::V0_13, Feature, MoveQueue, Next, Object, Oid,
-    Present, PromptLine, Report, Response, SPIN_MAX, Timer, WireClock, command, response, since,
+    Batch, Command, Constant, Context, Feature, MoveQueue, Next, Object, Oid, Present, PromptLine, Report, Response,
+    SPIN_MAX, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -15,6 +16,8 @@ use crate::time::{Clock, Ticks};
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "steppers",
+
     commands: &[
         CONFIG_STEPPER,
         QUEUE_STEP,
@@ -25,7 +28,7 @@ pub(super) const FEATURE: Feature = Feature {
         STEPPER_STOP_ON_TRIGGER,
     ],
     responses: &[Position::FORM],
-    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1).of(since(V0_13))],
+    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1).of(&[V0_13, Master, Kalico])],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -396,7 +399,7 @@ const QUEUE_STEP_HP: Command = command!(
         stepper.queue(context, Move { interval, count, add, add2, shift: shift as i8, reverses: false })
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", Stepper, |stepper, _, dir: bool| {
     stepper.next_dir = dir;

@@ -5,16 +5,19 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Back, Command, Context, DialectName::Kalico, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid,
-    Response, Timer, WireClock, command, response, since,
+    Back, Command, Context, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer,
+    WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 use crate::trouble::Trouble;
 
+use super::ds18b20::CONFIG_DS18B20_OF_KALICO;
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "MAX31855, MAX31856, MAX31865 and MAX6675 sensors",
+
     commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE],
     responses: &[Reading::FORM],
     enumerations: &[Enumeration::new("thermocouple_type", types)],
@@ -158,7 +161,7 @@ struct Thermocouple {
 impl Thermocouple {
     fn check(&mut self, context: &Context, value: u32, fault: u8) -> Result<(), Shutdown> {
         // This is Kalico's way to say that only the host checks the values.
-        if self.max_invalid_count == 0 && context.serves(since(Kalico)) {
+        if self.max_invalid_count == 0 && context.takes(&CONFIG_DS18B20_OF_KALICO) {
             return Ok(());
         }
         if fault == 0 && (self.min_value..=self.max_value).contains(&value) {

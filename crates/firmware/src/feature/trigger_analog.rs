@@ -3,9 +3,9 @@
 //! host's value. Samples out of range, a filter overflow, an error of the sensor and a silent sensor also pull it. Each
 //! has a reason of its own.
 
+use crate::mcu::DialectName::Master;
 use crate::mcu::{
-    Command, Context, DialectName::Master, Enumeration, Feature, Next, Object, Oid, Response, Timer, WireClock,
-    command, response, since,
+    Command, Context, Enumeration, Feature, Hosts, Next, Object, Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -16,6 +16,8 @@ use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "load cell probes and eddy current probes",
+
     commands: &[
         CONFIG_TRIGGER_ANALOG,
         TRIGGER_ANALOG_SET_RAW_RANGE,
@@ -26,7 +28,7 @@ pub(super) const FEATURE: Feature = Feature {
     responses: &[State::FORM],
     enumerations: &[
         Enumeration::new("trigger_analog_type", |_| named(&TriggerType::ALL.map(|(type_, name)| (name, type_ as u8))))
-            .of(since(Master)),
+            .of(&[Master]),
         Enumeration::new("trigger_analog_error:", |_| {
             named(&[
                 ("RAW_RANGE", RAW_RANGE),
@@ -35,7 +37,7 @@ pub(super) const FEATURE: Feature = Feature {
                 ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
             ])
         })
-        .of(since(Master)),
+        .of(&[Master]),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -48,7 +50,7 @@ shutdowns! {
 
 response! {
     /// Whether samples are checked, and when the trigger came.
-    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => since(Master);
+    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => Hosts::of(&[Master]);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
@@ -253,7 +255,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
         };
         context.assign(oid, trigger)
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
     "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
@@ -264,7 +266,7 @@ const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
         Ok(())
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
@@ -275,7 +277,7 @@ const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
         Ok(())
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
@@ -310,11 +312,11 @@ const TRIGGER_ANALOG_HOME: Command = command!(
         context.schedule(TIMER, at)
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_QUERY_STATE: Command =
     command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, context| {
         context.send(State { oid: context.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
         Ok(())
     })
-    .of(since(Master));
+    .of(&[Master]);

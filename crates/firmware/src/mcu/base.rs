@@ -5,10 +5,11 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
 
 use super::stats::SUMSQ_BASE;
-use super::{Command, Constant, Dialects, Enumeration, Feature, Form, Response, command, response};
+use super::{Command, Constant, Enumeration, Feature, Form, Hosts, Response, command, response};
 
 /// This file's entries in the dictionary.
 pub const FEATURE: Feature = Feature {
+    serves: "every printer",
     commands: &[
         IDENTIFY,
         GET_CLOCK,
@@ -47,7 +48,7 @@ const RESPONSES: &[Form] = &[
     Stats::FORM,
     Pong::FORM,
     // Never sent, because `debug_read` is refused. Klipper's dictionary has it.
-    Form { format: "debug_result val=%u", dialects: Dialects::ALL },
+    Form { format: "debug_result val=%u", hosts: Hosts::ALL },
 ];
 
 /// How many bytes the host may send before an acknowledgement. It is half of a pty's buffer of 4096 bytes. So the
