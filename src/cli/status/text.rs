@@ -69,7 +69,10 @@ fn state(status: &Status) -> String {
 }
 
 fn host(host: &Host, mcu: Option<&McuStatus>) -> String {
-    let dialect = mcu.and_then(|mcu| mcu.dialect.as_ref()).map_or(String::new(), |name| format!("; dialect {name}"));
+    let dialect = mcu.and_then(|mcu| mcu.dialect.as_ref()).map_or(String::new(), |name| match name.as_str() {
+        "host" => "; its own messages".to_owned(),
+        name => format!("; dialect {name}"),
+    });
     if !host.attached {
         return format!("none is attached{dialect}");
     }

@@ -369,4 +369,4 @@ const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     AnalogIn,
     |input, context, trigger_analog_oid: Oid| input.attached.attach(context, trigger_analog_oid)
 )
-.of(&[Master]);
+.hosts(Hosts::of(&[Master]).with(QUERY_ANALOG_IN_FOR_BATCHES.format));

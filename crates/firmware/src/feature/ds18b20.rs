@@ -8,8 +8,8 @@
 use crate::board::Thermometer;
 use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock,
-    command, response,
+    Back, Command, Context, DeviceId, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid, Response, Timer,
+    WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -18,8 +18,8 @@ use crate::trouble::Trouble;
 pub(super) const FEATURE: Feature = Feature {
     serves: "DS18B20 sensors",
 
-    commands: &[CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
-    responses: &[Reading::FORM],
+    commands: &[CONFIG_DS18B20_OF_V0_10, CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
+    responses: &[ReadingOfV010::FORM, Reading::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -33,6 +33,12 @@ shutdowns! {
     TOO_SLOW = "DS18B20 sensor didn't respond in time";
     /// A temperature outside its range.
     OUT_OF_RANGE = "DS18B20 out of range";
+}
+
+response! {
+    /// A temperature in thousandths of a degree.
+    "ds18b20_result oid=%c next_clock=%u value=%i" => Hosts::of(&[]).with(CONFIG_DS18B20_OF_V0_10.format);
+    pub(super) struct ReadingOfV010 { oid: Oid, next_clock: Clock, value: i32 }
 }
 
 response! {
@@ -134,12 +140,10 @@ impl Object for Ds18b20 {
             }
         }
         let fault = self.error_count;
-        context.send(Reading {
-            oid: context.oid(),
-            next_clock: self.next_clock,
-            value: self.value,
-            fault: fault.into(),
-        });
+        let (oid, next_clock, value) = (context.oid(), self.next_clock, self.value);
+        context.send(Reading { oid, next_clock, value, fault: fault.into() });
+        // The dictionary has one of both.
+        context.send(ReadingOfV010 { oid, next_clock, value });
         if fault == 0 { self.check_range(context) } else { Ok(()) }
     }
 
@@ -177,6 +181,12 @@ fn configure(
     };
     context.assign(oid, sensor)
 }
+
+const CONFIG_DS18B20_OF_V0_10: Command =
+    command!("config_ds18b20 oid=%c serial=%*s", |context, oid: Oid, serial: &[u8]| {
+        configure(context, oid, serial, 0, false)
+    })
+    .of(&[]);
 
 const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",

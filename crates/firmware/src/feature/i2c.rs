@@ -317,7 +317,7 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
         i2c.set_lines(context, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
     }
 )
-.of(&[V0_12, V0_13]);
+.hosts(Hosts::of(&[V0_12, V0_13]).unless(I2C_SET_SW_BUS.format));
 
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",

@@ -30,9 +30,11 @@ pub(super) const FEATURE: Feature = Feature {
         CONFIG_LDC1612,
         CONFIG_LDC1612_WITH_INTB,
         LDC1612_ATTACH_TRIGGER_ANALOG,
+        LDC1612_SETUP_HOME_WITHOUT_ERRORS,
         LDC1612_SETUP_HOME,
         QUERY_LDC1612_HOME_STATE,
         QUERY_LDC1612,
+        QUERY_LDC1612_STATUS,
         QUERY_STATUS_LDC1612,
     ],
     enumerations: &[Enumeration::new("ldc1612_error:", |_| {
@@ -143,7 +145,8 @@ struct Homing {
     /// A value above it is the trigger.
     threshold: u32,
     trigger_reason: u8,
-    error_reason: u8,
+    /// `None`: an error is a value as any other, and so is above the threshold.
+    error_reason: Option<u8>,
     /// Whether every sample so far was from before `clock`.
     awaits: bool,
     /// When homing begins. After the trigger: when it came.
@@ -152,14 +155,20 @@ struct Homing {
 
 impl Homing {
     /// Samples are not checked.
-    const OFF: Homing =
-        Homing { trsync: None, threshold: 0, trigger_reason: 0, error_reason: 0, awaits: false, clock: Clock::EPOCH };
+    const OFF: Homing = Homing {
+        trsync: None,
+        threshold: 0,
+        trigger_reason: 0,
+        error_reason: None,
+        awaits: false,
+        clock: Clock::EPOCH,
+    };
 
     /// Processes both words of channel 0, read at `at`.
     fn update(&mut self, context: &mut Context, words: u32, at: Clock) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
-        let reason = if words > DATA {
-            self.error_reason
+        let reason = if let (true, Some(reason)) = (words > DATA, self.error_reason) {
+            reason
         } else if self.awaits && at < self.clock {
             return Ok(());
         } else if words > self.threshold {
@@ -278,6 +287,25 @@ impl Ldc1612 {
         Ok(())
     }
 
+    fn setup_home(
+        &mut self,
+        context: &mut Context,
+        clock: WireClock,
+        threshold: u32,
+        trsync_oid: Oid,
+        (trigger_reason, error_reason): (u8, Option<u8>),
+    ) -> Result<(), Shutdown> {
+        let clock = context.instant(clock);
+        if threshold == 0 {
+            self.homing.trsync = None;
+            return Ok(());
+        }
+        context.require::<Trsync>(trsync_oid)?;
+        let trsync = Some(trsync_oid);
+        self.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
+        Ok(())
+    }
+
     fn query_status(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         let Some(intb) = &self.intb else {
             return self.ask.send_to(context, self.i2c);
@@ -354,18 +382,20 @@ const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
     Ldc1612,
     |sensor, context, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
-        let clock = context.instant(clock);
-        if threshold == 0 {
-            sensor.homing.trsync = None;
-            return Ok(());
-        }
-        context.require::<Trsync>(trsync_oid)?;
-        let trsync = Some(trsync_oid);
-        sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
-        Ok(())
+        sensor.setup_home(context, clock, threshold, trsync_oid, (trigger_reason, Some(error_reason)))
     }
 )
 .of(HOMES_ITSELF);
+
+/// The form of April and May 2024.
+const LDC1612_SETUP_HOME_WITHOUT_ERRORS: Command = command!(
+    "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c",
+    Ldc1612,
+    |sensor, context, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8| {
+        sensor.setup_home(context, clock, threshold, trsync_oid, (trigger_reason, None))
+    }
+)
+.of(&[]);
 
 const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", Ldc1612, |sensor, context| {
     let homing = &sensor.homing;
@@ -388,6 +418,10 @@ const QUERY_LDC1612: Command =
         context.schedule(TIMER, at)
     })
     .of(&[V0_13, Master, Kalico]);
+
+/// The name until June 2024.
+const QUERY_LDC1612_STATUS: Command =
+    command!("query_ldc1612_status oid=%c", Ldc1612, |sensor, context| sensor.query_status(context)).of(&[]);
 
 const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor
     .query_status(context))

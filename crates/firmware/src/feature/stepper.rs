@@ -19,6 +19,7 @@ pub(super) const FEATURE: Feature = Feature {
     serves: "steppers",
 
     commands: &[
+        CONFIG_STEPPER_OF_V0_10,
         CONFIG_STEPPER,
         QUEUE_STEP,
         QUEUE_STEP_HP,
@@ -344,35 +345,56 @@ impl Object for Stepper {
     }
 }
 
+fn configure(
+    context: &mut Context,
+    oid: Oid,
+    [step_pin, dir_pin]: [Pin; 2],
+    invert_step: i8,
+    step_pulse_ticks: Ticks,
+) -> Result<(), Shutdown> {
+    context.vacant(oid)?;
+    let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
+    // After a step on either edge, a stop leaves the level: another edge would be another step.
+    let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
+    let dir = context.prompt_output(dir_pin, "dir", false, false)?;
+    let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
+    let stepper = Stepper {
+        step,
+        dir,
+        idle_step,
+        edges_back: u32::from(!both_edges),
+        pulse_ticks,
+        late_limit: context.step_late_limit(),
+        queue: MoveQueue::default(),
+        edges: 0,
+        intervals: Intervals::default(),
+        next_step: Clock::EPOCH,
+        earliest: Clock::EPOCH,
+        reverse_pending: false,
+        position: POSITION_BIAS.wrapping_neg(),
+        last_dir: false,
+        next_dir: false,
+        need_reset: false,
+        stopper: None,
+    };
+    context.assign_on(step_pin, oid, stepper)
+}
+
+/// How long a step pulse is at least with hosts that do not say it (`STEP_DELAY`).
+const STEP_PULSE: Ticks = Ticks::from_us(2);
+
+const CONFIG_STEPPER_OF_V0_10: Command = command!(
+    "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c",
+    |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: bool| {
+        configure(context, oid, [step_pin, dir_pin], invert_step.into(), STEP_PULSE)
+    }
+)
+.of(&[]);
+
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
     |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
-        context.vacant(oid)?;
-        let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
-        // After a step on either edge, a stop leaves the level: another edge would be another step.
-        let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
-        let dir = context.prompt_output(dir_pin, "dir", false, false)?;
-        let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
-        let stepper = Stepper {
-            step,
-            dir,
-            idle_step,
-            edges_back: u32::from(!both_edges),
-            pulse_ticks,
-            late_limit: context.step_late_limit(),
-            queue: MoveQueue::default(),
-            edges: 0,
-            intervals: Intervals::default(),
-            next_step: Clock::EPOCH,
-            earliest: Clock::EPOCH,
-            reverse_pending: false,
-            position: POSITION_BIAS.wrapping_neg(),
-            last_dir: false,
-            next_dir: false,
-            need_reset: false,
-            stopper: None,
-        };
-        context.assign_on(step_pin, oid, stepper)
+        configure(context, oid, [step_pin, dir_pin], invert_step, step_pulse_ticks)
     }
 );
 

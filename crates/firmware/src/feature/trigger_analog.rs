@@ -25,7 +25,7 @@ pub(super) const FEATURE: Feature = Feature {
         TRIGGER_ANALOG_HOME,
         TRIGGER_ANALOG_QUERY_STATE,
     ],
-    responses: &[State::FORM],
+    responses: &[StateWithTrigger::FORM, State::FORM],
     enumerations: &[
         Enumeration::new("trigger_analog_type", |_| named(&TriggerType::ALL.map(|(type_, name)| (name, type_ as u8))))
             .of(&[Master]),
@@ -46,6 +46,12 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// A `trigger_analog_type` outside the enumeration. (Pinion's own text. In Klipper's C nothing triggers then.)
     INVALID_TYPE = "Invalid trigger_analog_type";
+}
+
+response! {
+    /// The form of 25 to 29 January 2026: when the sample came that decided, which is the peak before a tap.
+    "trigger_analog_state oid=%c homing=%c trigger_clock=%u" => Hosts::of(&[]);
+    pub(super) struct StateWithTrigger { oid: Oid, homing: bool, trigger_clock: Clock }
 }
 
 response! {
@@ -105,6 +111,8 @@ pub(super) struct TriggerAnalog {
     awaits: bool,
     /// When homing begins. After the trigger: when it came.
     homing_clock: Clock,
+    /// When the last sample came that may be the trigger. For [`TriggerType::DiffPeakGt`]: when the peak came.
+    trigger_clock: Clock,
     trsync: Option<Oid>,
     trigger_reason: u8,
     error_reason: u8,
@@ -128,7 +136,7 @@ impl TriggerAnalog {
         let Ok(value) = context.with::<SosFilter, _>(self.filter, |filter, _| Ok(filter.apply(sample)))? else {
             return self.fail(context, OVERFLOW);
         };
-        if !self.crosses(value) {
+        if !self.crosses(value, at) {
             return Ok(());
         }
         self.homing = false;
@@ -138,7 +146,10 @@ impl TriggerAnalog {
 
     /// Whether a filtered value pulls the trigger. Klipper's C compares a negative trigger value as unsigned, except
     /// for [`TriggerType::Gt`].
-    fn crosses(&mut self, value: i32) -> bool {
+    fn crosses(&mut self, value: i32, at: Clock) -> bool {
+        if self.trigger_type != TriggerType::DiffPeakGt || value > self.peak {
+            self.trigger_clock = at;
+        }
         match self.trigger_type {
             TriggerType::AbsGe => value.unsigned_abs() >= self.trigger_value as u32,
             TriggerType::Gt => value > self.trigger_value,
@@ -246,6 +257,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
             homing: false,
             awaits: false,
             homing_clock: Clock::EPOCH,
+            trigger_clock: Clock::EPOCH,
             trsync: None,
             trigger_reason: 0,
             error_reason: 0,
@@ -316,7 +328,10 @@ const TRIGGER_ANALOG_HOME: Command = command!(
 
 const TRIGGER_ANALOG_QUERY_STATE: Command =
     command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, context| {
-        context.send(State { oid: context.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
+        let (oid, homing) = (context.oid(), trigger.homing);
+        context.send(State { oid, homing, homing_clock: trigger.homing_clock });
+        // The dictionary has one of both.
+        context.send(StateWithTrigger { oid, homing, trigger_clock: trigger.trigger_clock });
         Ok(())
     })
     .of(&[Master]);

@@ -41,6 +41,7 @@ const RESPONSES: &[Form] = &[
     IdentifyResponse::FORM,
     ClockResponse::FORM,
     Uptime::FORM,
+    ConfigOfV010::FORM,
     Config::FORM,
     Starting::FORM,
     ShutdownReport::FORM,
@@ -93,6 +94,18 @@ response! {
     /// Whether the MCU is configured, and the checksum of that configuration, as the host gave it.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
+}
+
+response! {
+    /// The same in the order of hosts before November 2021.
+    "config is_config=%c crc=%u move_count=%hu is_shutdown=%c" => Hosts::of(&[]);
+    pub struct ConfigOfV010 { is_config: bool, crc: u32, move_count: u16, is_shutdown: bool }
+}
+
+impl From<Config> for ConfigOfV010 {
+    fn from(Config { is_config, crc, is_shutdown, move_count }: Config) -> ConfigOfV010 {
+        ConfigOfV010 { is_config, crc, move_count, is_shutdown }
+    }
 }
 
 impl Config {
@@ -176,8 +189,9 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu: &mut Mcu| {
 .allowed_in_shutdown();
 
 const GET_CONFIG: Command = command!("get_config", |mcu: &mut Mcu| {
-    let config = mcu.config();
-    mcu.state.wire.send(config);
+    mcu.state.wire.send(mcu.config());
+    // The dictionary has one of both.
+    mcu.state.wire.send(ConfigOfV010::from(mcu.config()));
     Ok(())
 })
 .allowed_in_shutdown();

@@ -4,7 +4,7 @@
 use std::collections::HashSet;
 use std::io;
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::board::{Board, Range};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
@@ -80,6 +80,24 @@ pub struct Firmware {
     pub license: &'static str,
     /// The wire that its host is on.
     pub wire: Wire,
+}
+
+/// The names that a board adds to a dictionary.
+pub struct Names {
+    /// The values of the enumerations, in the order of [`entries`]. Empty for other entries.
+    values: Vec<Map<String, Value>>,
+    constants: Vec<(String, Value)>,
+}
+
+impl Names {
+    /// The present names of a board.
+    pub fn of(firmware: &Firmware, board: &dyn Board) -> Names {
+        let values = |entry: Entry| match entry.item {
+            Item::Enumeration(enumeration) => numbers((enumeration.values)(board)),
+            _ => Map::new(),
+        };
+        Names { values: entries(firmware.features).into_iter().map(values).collect(), constants: board.constants() }
+    }
 }
 
 /// The messages that a host and the MCU may exchange, by their ids.
@@ -180,8 +198,8 @@ fn number(chosen: &[(Entry, Part)], dictionary: &mut Dictionary) -> io::Result<N
 }
 
 /// Adds the constants and enumerations to the dictionary.
-fn publish_names(chosen: &[(Entry, Part)], firmware: &Firmware, board: &dyn Board, dictionary: &mut Dictionary) {
-    for (entry, _) in chosen.iter().filter(|(_, part)| *part == Part::Needed) {
+fn publish_names(chosen: &[(Entry, Part)], firmware: &Firmware, names: &Names, dictionary: &mut Dictionary) {
+    for ((entry, _), values) in chosen.iter().zip(&names.values).filter(|((_, part), _)| *part == Part::Needed) {
         match entry.item {
             Item::Constant(constant) => {
                 let value = match constant.value {
@@ -191,8 +209,7 @@ fn publish_names(chosen: &[(Entry, Part)], firmware: &Firmware, board: &dyn Boar
                 dictionary.config.insert(constant.name.into(), value);
             }
             Item::Enumeration(enumeration) => {
-                let values = names((enumeration.values)(board));
-                dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
+                dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values.clone()));
             }
             Item::Command(_) | Item::Response(_) => {}
         }
@@ -200,17 +217,21 @@ fn publish_names(chosen: &[(Entry, Part)], firmware: &Firmware, board: &dyn Boar
     if let Some((name, value)) = firmware.wire.rate() {
         dictionary.config.insert(name.into(), json!(value));
     }
-    dictionary.config.extend(board.constants());
+    dictionary.config.extend(names.constants.iter().cloned());
 }
 
 impl Dialect {
     /// Gives ids to the messages of these forms, and makes the dictionary with the board's names.
     pub fn new(firmware: &Firmware, board: &dyn Board, forms: impl Into<Forms>) -> io::Result<Dialect> {
-        let forms = forms.into();
+        Dialect::with_names(firmware, &Names::of(firmware, board), forms.into())
+    }
+
+    /// The same, with the board's names as they were.
+    pub fn with_names(firmware: &Firmware, names: &Names, forms: Forms) -> io::Result<Dialect> {
         let chosen = firmware.choose(&forms);
         let mut dictionary = head(firmware, &forms);
         let (commands, response_ids) = number(&chosen, &mut dictionary)?;
-        publish_names(&chosen, firmware, board, &mut dictionary);
+        publish_names(&chosen, firmware, names, &mut dictionary);
         let needed = chosen.iter().filter(|(_, part)| *part == Part::Needed).map(|(entry, _)| entry.text).collect();
         let features = firmware.features.iter().filter(|feature| (feature.is_on)(&firmware.wire));
         let shutdowns: Vec<ShutdownReason> = features.flat_map(|feature| feature.shutdowns).copied().collect();
@@ -320,7 +341,7 @@ impl Dialect {
     }
 }
 
-fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
+fn numbers(ranges: Vec<Range>) -> Map<String, Value> {
     ranges
         .into_iter()
         .map(|range| match range.count {

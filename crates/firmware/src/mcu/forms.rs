@@ -161,13 +161,13 @@ impl Forms {
 }
 
 /// An entry's part in a dictionary.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Part {
     /// The dictionary does not have it.
     Left,
-    /// The host needs it.
+    /// The host looks it up, or all hosts have it.
     Needed,
-    /// The host does not look up its name. The dictionary has it if there is room.
+    /// The host does not look up its name, and not every dialect has it. The dictionary has it if there is room.
     Spare,
 }
 
@@ -190,27 +190,23 @@ fn of_host(forms: &HostForms, entries: &[Entry]) -> Vec<Part> {
     let looked_up: HashSet<&str> =
         forms.0.iter().filter_map(|place| Some(entries.get(usize::from(*place))?.text)).collect();
     let is_replaced = |entry: &Entry| entry.hosts.unless.is_some_and(|format| looked_up.contains(format));
-    let mut chosen: HashMap<_, (usize, Part)> = HashMap::new();
+    // Of each name: whether the best entry is looked up, its place, and its part.
+    let mut chosen: HashMap<_, (bool, usize, Part)> = HashMap::new();
     for (place, entry) in entries.iter().enumerate().filter(|(_, entry)| !is_replaced(entry)) {
         let is_looked_up =
             looked_up.contains(entry.text) || entry.hosts.with.is_some_and(|format| looked_up.contains(format));
         let is_everybodys = entry.hosts.dialects.len() == DialectName::OF_HOSTS.len();
-        let part = match entry.is_message() {
-            _ if is_looked_up => Part::Needed,
-            true => Part::Spare,
-            false if is_everybodys => Part::Needed,
-            // A constant is a promise, so only hosts that know it get it.
-            false => continue,
-        };
-        let best = chosen.entry(entry.key()).or_insert((place, part));
-        if (part, best.1) != (Part::Spare, Part::Needed) {
-            *best = (place, part);
+        // A constant is a promise, so only hosts that know it get it.
+        if !is_looked_up && !is_everybodys && !entry.is_message() {
+            continue;
         }
+        let part = if is_looked_up || is_everybodys { Part::Needed } else { Part::Spare };
+        let best = chosen.entry(entry.key()).or_insert((is_looked_up, place, part));
+        *best = (*best).max((is_looked_up, place, part));
     }
     let mut parts = vec![Part::Left; entries.len()];
-    for (place, part) in chosen.into_values() {
-        // The MCU's own messages are the same in every dictionary.
-        parts[place] = if entries[place].feature == 0 { Part::Needed } else { part };
+    for (_, place, part) in chosen.into_values() {
+        parts[place] = part;
     }
     parts
 }

@@ -57,7 +57,8 @@ impl HostWire {
         if self.is_foreign() && !base::is_own_response(R::INDEX) {
             return;
         }
-        let Some(id) = self.dialect.response_id::<R>() else { return };
+        // The MCU's own messages are in the form of the present host.
+        let Some(id) = self.heard().response_id::<R>() else { return };
         let mut writer = Writer::default();
         writer.int(id);
         response.encode(&mut writer);

@@ -48,7 +48,7 @@ pub use bus::{Bus, Chip};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use context::Context;
-pub use dialect::{Dialect, Firmware};
+pub use dialect::{Dialect, Firmware, Names};
 pub use dialects::DialectName;
 pub use forms::{Entry, Forms, HostForms, Hosts, Item, Part, entries};
 pub use inputs::{InputLine, Sample};

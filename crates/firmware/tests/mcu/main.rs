@@ -21,6 +21,7 @@ mod hx71x;
 mod i2c;
 mod kalico;
 mod ldc1612;
+mod months;
 mod neopixel;
 mod older_hosts;
 mod one_order;
