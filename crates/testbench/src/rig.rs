@@ -49,6 +49,7 @@ impl Outbox for FakeOutbox {
             Note::Safe(name) => format!("safe: {name}"),
             Note::Lateness(..) => return,
             Note::Reset => "reset".into(),
+            Note::Renewed => "renewed".into(),
         };
         self.notes.lock().unwrap().push(text);
     }

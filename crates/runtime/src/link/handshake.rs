@@ -16,7 +16,7 @@ use pinion_linux::clock::monotonic;
 use crate::FIRMWARE;
 
 use crate::core::responses::LinkWake;
-use crate::host::search::{HostFinder, HostSearch};
+use crate::host::search::{Found, HostFinder, HostSearch};
 use crate::link::survey::{self, Surveyor};
 use crate::status::HostStatus;
 use crate::trouble::started;
@@ -48,6 +48,8 @@ pub(crate) struct Handshake {
 pub(crate) enum Step {
     /// The host's bytes have to wait.
     Wait,
+    /// The process that configured the MCU is gone, and another one has come.
+    Renew,
     /// This dialect is spoken from now on.
     Speak(Arc<Dialect>),
     /// Everything is found.
@@ -102,17 +104,20 @@ impl Handshake {
         self.until = None;
     }
 
-    /// Goes on as far as it can. Call it again after [`Step::Speak`].
+    /// Goes on as far as it can. Call it again until it is [`Step::Wait`] or [`Step::Done`].
     pub(crate) fn step(&mut self) -> Step {
         let (Some(until), Some(surveyor)) = (self.until, &mut self.surveyor) else {
             self.hear_late_answer();
             return Step::Done;
         };
         if self.is_finding
-            && let Some(forms) = self.finder.as_ref().and_then(HostFinder::answer)
+            && let Some(Found { forms, is_other }) = self.finder.as_ref().and_then(HostFinder::answer)
         {
             self.is_finding = false;
             surveyor.make(forms);
+            if is_other {
+                return Step::Renew;
+            }
         }
         let is_late = monotonic() >= until;
         if !is_late && (self.is_finding || !surveyor.is_done()) {
@@ -139,7 +144,7 @@ impl Handshake {
     /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
         let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
-        let Some(forms) = answer else { return };
+        let Some(Found { forms, .. }) = answer else { return };
         self.is_overdue = false;
         if forms != *self.first.forms() {
             warn!("the host's messages were found too late: send RESTART to use them");

@@ -328,6 +328,7 @@ impl LinkThread {
         loop {
             match self.handshake.step() {
                 Step::Wait => return true,
+                Step::Renew => self.request(Request::Renew),
                 Step::Speak(dialect) => self.speak(dialect),
                 Step::Done => return false,
             }

@@ -16,7 +16,7 @@ use nix::sys::socket::{MsgFlags, recv, send};
 use nix::unistd::{SysconfVar, sysconf};
 use serde::Serialize;
 
-use crate::host::klippy::process::Process;
+use crate::host::klippy::process::{self, Process};
 use crate::host::klippy::terminal::{Search, Terminal, find};
 use crate::host::klippy::{Checkout, names, parts_without};
 use pinion_firmware::feature::FEATURES;
@@ -58,7 +58,7 @@ pub(super) fn live(socket: &OwnedFd) {
         let Ok(Question { number, terminal }) = question else { return };
         let (forms, host) = looker.look(terminal);
         let lines = std::mem::take(&mut looker.say.0);
-        if !say(socket, &Answer::new(number, forms.as_ref(), host, lines)) {
+        if !say(socket, &Answer::new(number, forms.as_ref(), looker.is_other, host, lines)) {
             return;
         }
     }
@@ -109,17 +109,37 @@ struct Looker {
     /// The host that was seen last. A process continues with the sources that it has loaded, even if the files change.
     /// klippy's RESTART keeps the process. A host whose sources could not be read is inspected again.
     last: Option<(Process, HostForms)>,
+    /// The process that had the terminal open before, as long as it lives. `None` if nobody knows.
+    before: Option<Process>,
+    /// That process is gone, and the present one is another.
+    is_other: bool,
     /// The same host, for the status.
     host: Option<FoundHost>,
     say: Say,
 }
 
 impl Looker {
+    /// Notes whether the process that has the terminal open is another than before. A process that only looks in while
+    /// the host lives is none.
+    fn meet(&mut self, process: &Process) {
+        let is_gone = self.before.as_ref().map(|before| is_gone(before));
+        self.is_other = is_gone == Some(true);
+        if is_gone != Some(false) {
+            self.before = Some(process.clone());
+        }
+    }
+
     fn look(&mut self, terminal: Terminal) -> (Option<HostForms>, Option<FoundHost>) {
         let began = Instant::now();
         let unknown = (None, None);
+        self.is_other = false;
+        let search = find(Path::new(PROC), terminal);
+        match &search {
+            Ok(Search::Found(process)) => self.meet(process),
+            _ => self.before = None,
+        }
         let say = &mut self.say;
-        let (process, is_sure) = match find(Path::new(PROC), terminal) {
+        let (process, is_sure) = match search {
             Ok(Search::Found(process)) => (process, true),
             // The host is one of these, and all of them run from the same sources.
             Ok(Search::Hidden(mut processes)) if same_folder(&processes) => (processes.remove(0), false),
@@ -142,7 +162,7 @@ impl Looker {
             }
         };
         if let Some((last, forms)) = &self.last
-            && (last.pid, last.started) == (process.pid, process.started)
+            && is_same(last, &process)
         {
             say.info(format!("the host is the one of before, process {}", process.pid));
             return (Some(forms.clone()), self.host.clone());
@@ -154,6 +174,16 @@ impl Looker {
         self.last = forms.clone().map(|forms| (process, forms));
         (forms, self.host.clone())
     }
+}
+
+/// Whether this is one process.
+fn is_same(one: &Process, other: &Process) -> bool {
+    (one.pid, one.started) == (other.pid, other.started)
+}
+
+/// Whether a process has ended. A process that nobody waits for has no command line.
+fn is_gone(process: &Process) -> bool {
+    process::of(Path::new(PROC), process.pid).is_none_or(|now| !is_same(&now, process) || now.arguments.is_empty())
 }
 
 /// Whether there are processes, and all of them run from one folder.

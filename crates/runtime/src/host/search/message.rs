@@ -48,6 +48,8 @@ pub(super) struct Answer {
     pub(super) number: u32,
     /// The places of the forms that the host looks up. `None` if they are unknown.
     forms: Option<Vec<u16>>,
+    /// The process of the host before is gone, and this is another one.
+    pub(super) is_other: bool,
     pub(super) host: Option<FoundHost>,
     pub(super) lines: Vec<Line>,
 }
@@ -62,9 +64,15 @@ fn bounded(text: &str, chars_max: usize) -> String {
 }
 
 impl Answer {
-    pub(super) fn new(number: u32, forms: Option<&HostForms>, host: Option<FoundHost>, lines: Vec<Line>) -> Answer {
+    pub(super) fn new(
+        number: u32,
+        forms: Option<&HostForms>,
+        is_other: bool,
+        host: Option<FoundHost>,
+        lines: Vec<Line>,
+    ) -> Answer {
         let forms = forms.map(|forms| forms.places().collect());
-        Answer { number, forms, host, lines }.bounded()
+        Answer { number, forms, is_other, host, lines }.bounded()
     }
 
     /// The forms for the host. Unknown hosts get the union, which most hosts accept. Any places make a dictionary.
@@ -133,7 +141,7 @@ mod tests {
             let host = FoundHost { pid, is_sure, is_attach: is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
             let line = || Line { is_warning: is_sure, text: text.clone() };
             let lines = (0..lines).map(|_| line()).collect();
-            let sent = Answer { number: pid, forms: None, host: Some(host), lines };
+            let sent = Answer { number: pid, forms: None, is_other: is_sure, host: Some(host), lines };
             // Anything may come over the socket.
             let heard = Answer::decode(&serde_json::to_vec(&sent).unwrap()).unwrap();
             prop_assert_eq!(heard.forms(), Forms::Dialect(DialectName::Union));
@@ -149,7 +157,9 @@ mod tests {
     #[test]
     fn forms_are_those_that_the_host_looks_up() {
         let answer = |forms: &str| {
-            Answer::decode(format!(r#"{{"number":1,"forms":{forms},"host":null,"lines":[]}}"#).as_bytes())
+            Answer::decode(
+                format!(r#"{{"number":1,"forms":{forms},"is_other":false,"host":null,"lines":[]}}"#).as_bytes(),
+            )
         };
         assert_eq!(answer("[3,1,65535]").unwrap().forms(), Forms::Host([1, 3, 65535].into_iter().collect()));
         assert_eq!(answer("null").unwrap().forms(), Forms::Dialect(DialectName::Union));

@@ -87,12 +87,25 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
     }
 }
 
+/// What the search found out about a host.
+pub(crate) struct Found {
+    /// The forms of messages for it.
+    pub(crate) forms: Forms,
+    /// The process of the host before is gone, and this is another one.
+    pub(crate) is_other: bool,
+}
+
+impl Found {
+    /// Nothing is known.
+    const NOTHING: Found = Found { forms: Forms::Dialect(DialectName::Union), is_other: false };
+}
+
 /// The link's way to the search. A thread receives the answers.
 pub(crate) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
     board: Arc<HostStatus>,
-    answers: Receiver<(u32, Forms)>,
+    answers: Receiver<(u32, Found)>,
     /// The number of the last question.
     asked: u32,
 }
@@ -118,9 +131,9 @@ impl HostFinder {
                 for line in &answer.lines {
                     log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
                 }
-                let forms = answer.forms();
+                let found = Found { forms: answer.forms(), is_other: answer.is_other };
                 shown.found(answer.host);
-                let sent = sender.send((answer.number, forms));
+                let sent = sender.send((answer.number, found));
                 wake.wake();
                 if sent.is_err() {
                     return;
@@ -147,13 +160,13 @@ impl HostFinder {
     }
 
     /// The answer to the last question, if it has come.
-    pub(crate) fn answer(&self) -> Option<Forms> {
+    pub(crate) fn answer(&self) -> Option<Found> {
         loop {
             match self.answers.try_recv() {
-                Ok((number, forms)) if number == self.asked => return Some(forms),
+                Ok((number, found)) if number == self.asked => return Some(found),
                 Ok(_) => {}
                 Err(TryRecvError::Empty) => return None,
-                Err(TryRecvError::Disconnected) => return Some(DialectName::Union.into()),
+                Err(TryRecvError::Disconnected) => return Some(Found::NOTHING),
             }
         }
     }
