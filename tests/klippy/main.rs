@@ -14,6 +14,7 @@ mod klippy;
 mod leveling;
 mod links;
 mod mainsail;
+mod months;
 mod own_printer;
 mod print;
 mod printer_cfg;

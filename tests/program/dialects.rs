@@ -205,6 +205,45 @@ fn a_process_goes_on_with_the_sources_that_it_has_loaded() {
     pinion.logged(&format!("the host is the one of before, process {}", host.0.0.id()));
 }
 
+/// Configures the MCU, and stops it.
+fn configure_and_stop(pinion: &Pinion) {
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
+    config.apply(&mut client).unwrap();
+    until_once_more(pinion, "shutdown: ", || client.send_line("emergency_stop").unwrap());
+}
+
+fn is_shutdown(pinion: &Pinion) -> bool {
+    pinion.client().status().unwrap().is_shutdown
+}
+
+#[test]
+fn a_new_process_of_the_host_finds_a_fresh_mcu_and_the_same_one_does_not() {
+    const RENEWED: &str = "the host's process is gone and another has come: the MCU is reset for it";
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("master");
+    let mut host = Host::start(&pinion, &checkout);
+    configure_and_stop(&pinion);
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    host.turn("open");
+    assert!(is_shutdown(&pinion), "RESTART keeps the process");
+    assert!(!pinion.log().contains(RENEWED));
+    until_once_more(&pinion, "host gone", || drop(host));
+    let mut host = Host::start(&pinion, &checkout);
+    assert!(!is_shutdown(&pinion), "a new process");
+    pinion.logged(RENEWED);
+    // A process that looks in while the host lives changes nothing.
+    configure_and_stop(&pinion);
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    let other = Host::start(&pinion, &checkout);
+    assert!(is_shutdown(&pinion), "the host lives");
+    until_once_more(&pinion, "host gone", || drop(other));
+    host.turn("open");
+    assert!(is_shutdown(&pinion), "the host of before");
+}
+
 #[test]
 fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     let pinion = Pinion::simulated(&[]);

@@ -30,6 +30,7 @@ mod plain_board;
 mod pwm_out;
 mod ready_adc;
 mod remedies;
+mod renew;
 mod safe_ends;
 mod sleeping_lines;
 mod snapshot;
