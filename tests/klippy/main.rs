@@ -15,6 +15,7 @@ mod leveling;
 mod links;
 mod mainsail;
 mod months;
+mod non_critical;
 mod own_printer;
 mod print;
 mod printer_cfg;

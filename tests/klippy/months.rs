@@ -118,18 +118,20 @@ fn use_everything(checkout: &Path) {
     assert_eq!(printer.object("gcode_button knob")["state"], "PRESSED");
     let config = fs::read_to_string(printer.path("printer.cfg")).unwrap();
     for chip in
-        ["adxl345", "lis2dw by_spi", "lis2dw by_i2c"].iter().filter(|chip| config.contains(&format!("[{chip}]")))
+        ["adxl345", "lis2dw by_spi", "lis2dw by_i2c"].iter().filter(|chip| config.contains(&format!("\n[{chip}]\n")))
     {
         let name = chip.split(' ').nth(1).map_or(String::new(), |name| format!(" CHIP={name}"));
         let answer = printer.answer(&format!("ACCELEROMETER_QUERY{name}"));
         let felt = rest(&answer, "accelerometer values (x, y, z): ");
         let z: f64 = felt.rsplit(", ").next().unwrap().parse().unwrap();
-        assert!((z - 9806.65).abs() < 500.0, "{chip}: {felt}");
+        // Older hosts set a LIS2DW's range and read its samples with the scale of another.
+        let is_right = if *chip == "adxl345" { (z - 9806.65).abs() < 500.0 } else { z > 9000.0 };
+        assert!(is_right, "{chip}: {felt}");
     }
-    if config.contains("[angle y]") {
+    if config.contains("\n[angle y]\n") {
         printer.gcode("ANGLE_CALIBRATE CHIP=y");
     }
-    if config.contains("[load_cell]") {
+    if config.contains("\n[load_cell]\n") {
         let said = printer.answer("LOAD_CELL_DIAGNOSTIC LOAD_CELL=load_cell");
         assert!(said.contains("Measured samples per second: "), "{said}");
     }

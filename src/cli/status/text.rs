@@ -118,6 +118,9 @@ fn object(object: &Object) -> Vec<String> {
         Present::Duty(share) => format!("on {:.1} %", share * 100.0),
         Present::Steps(steps) => format!("at {steps} steps"),
     }));
+    if object.repeats {
+        facts.push("fails, and repeats its last answers".into());
+    }
     if object.queued > 0 {
         facts.push(format!("{} queued", object.queued));
     }

@@ -269,7 +269,7 @@ impl Object for AnalogIn {
     }
 
     fn report(&self) -> Report {
-        Report { queued: 0, value: self.last.map(Present::Adc) }
+        Report { value: self.last.map(Present::Adc), ..Report::default() }
     }
 
     fn counts(&self) -> Option<BusCounts> {

@@ -175,7 +175,7 @@ impl Object for DigitalOut {
     }
 
     fn report(&self) -> Report {
-        Report { queued: self.queue.len(), value: None }
+        Report { queued: self.queue.len(), ..Report::default() }
     }
 
     fn shutdown(&mut self, context: &mut Context) {

@@ -8,8 +8,8 @@
 use crate::board::Thermometer;
 use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid, Response, Timer,
-    WireClock, command, response,
+    Back, Command, Context, Device, DeviceId, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid, Report,
+    Response, Timer, Tolerance, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -82,7 +82,12 @@ struct Ds18b20 {
     /// How many readings failed since the last success.
     error_count: u8,
     value: i32,
+    /// Whether a reading has succeeded.
+    has_value: bool,
+    tolerance: Option<Tolerance>,
 }
+
+const KIND: &str = "DS18B20";
 
 impl Ds18b20 {
     fn check_range(&self, context: &Context) -> Result<(), Shutdown> {
@@ -104,7 +109,11 @@ impl Ds18b20 {
 
 impl Object for Ds18b20 {
     fn kind(&self) -> &'static str {
-        "DS18B20"
+        KIND
+    }
+
+    fn report(&self) -> Report {
+        Report { repeats: self.tolerance.as_ref().is_some_and(Tolerance::is_used), ..Report::default() }
     }
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
@@ -129,7 +138,16 @@ impl Object for Ds18b20 {
             Ok(value) => {
                 self.value = value;
                 self.error_count = 0;
+                self.has_value = true;
+                if let Some(tolerance) = &mut self.tolerance {
+                    tolerance.works(context, KIND, READ_FAILED);
+                }
             }
+            Err(trouble)
+                if self.has_value
+                    && self.tolerance.as_mut().is_some_and(|tolerance| {
+                        tolerance.bears(context, KIND, |_| Shutdown::because(READ_FAILED, trouble.clone()))
+                    }) => {}
             Err(trouble) => {
                 self.error_count = self.error_count.saturating_add(1);
                 if self.error_count > self.max_error_count {
@@ -178,6 +196,8 @@ fn configure(
         ignores_limits,
         error_count: 0,
         value: 0,
+        has_value: false,
+        tolerance: context.tolerance(&Device::OneWire(String::from_utf8_lossy(serial).into_owned())),
     };
     context.assign(oid, sensor)
 }

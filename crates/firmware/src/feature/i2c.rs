@@ -10,8 +10,8 @@ use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Object, Oid, Response,
-    command, response,
+    Back, Bus, Chip, Command, Context, Device, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Object, Oid,
+    Report, Response, Tolerance, command, response,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -172,6 +172,8 @@ impl Job for Transfer {
     }
 }
 
+const KIND: &str = "I2C device";
+
 /// An I2C device.
 pub(super) struct I2c {
     bus: Option<Bus>,
@@ -181,18 +183,76 @@ pub(super) struct I2c {
     /// Whether the last transfer failed. Only the first failure is logged: an unplugged display fails many times a
     /// second.
     failing: bool,
+    /// The last answers, if the user tolerates failures.
+    tolerance: Option<(Tolerance, Answers)>,
+}
+
+/// The last answers of a device, to be repeated while it fails.
+#[derive(Default)]
+struct Answers(Vec<Answer>);
+
+struct Answer {
+    write: [u8; PAYLOAD_MAX],
+    write_len: usize,
+    read: [u8; u8::MAX as usize],
+    read_len: usize,
+}
+
+impl Answers {
+    /// Highest number of different questions.
+    const MAX: usize = 16;
+
+    fn new() -> Answers {
+        Answers(Vec::with_capacity(Answers::MAX))
+    }
+
+    fn place(&self, transfer: &Transfer) -> Option<usize> {
+        let written = &transfer.write[..transfer.write_len];
+        self.0
+            .iter()
+            .position(|answer| answer.read_len == transfer.read_len && &answer.write[..answer.write_len] == written)
+    }
+
+    /// Keeps an answer. Of too many different ones, the oldest is forgotten.
+    fn keep(&mut self, transfer: &Transfer) {
+        if transfer.read_len == 0 {
+            return;
+        }
+        let Transfer { write, write_len, read, read_len, .. } = *transfer;
+        if let Some(place) = self.place(transfer) {
+            self.0[place].read = read;
+            return;
+        }
+        if self.0.len() == Answers::MAX {
+            self.0.remove(0);
+        }
+        self.0.push(Answer { write, write_len, read, read_len });
+    }
+
+    /// Repeats the last answer to this question. False if there is none. A write to a device that is read has nothing
+    /// to repeat.
+    fn repeat(&self, transfer: &mut Transfer) -> bool {
+        match self.place(transfer) {
+            Some(place) => transfer.read = self.0[place].read,
+            None if transfer.read_len == 0 && !self.0.is_empty() => {}
+            None => return false,
+        }
+        true
+    }
 }
 
 impl I2c {
     fn new() -> I2c {
         let transfer = JobSlot::new(Transfer::new(Purpose::Transfer, &[], 0));
-        I2c { bus: None, on_lines: false, transfer, failing: false }
+        I2c { bus: None, on_lines: false, transfer, failing: false, tolerance: None }
     }
 
     fn set_bus(&mut self, context: &mut Context, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
         let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
         let opened = context.board()?.i2c(config)?;
         self.bus = Some(context.bus(opened)?);
+        let tolerance = context.tolerance(&Device::I2c(bus, config.address));
+        self.tolerance = tolerance.map(|tolerance| (tolerance, Answers::new()));
         Ok(())
     }
 
@@ -246,14 +306,30 @@ impl I2c {
 
 impl Object for I2c {
     fn kind(&self) -> &'static str {
-        "I2C device"
+        KIND
     }
 
     /// Reports the result of a transfer to the host. If the answer has no status, a failure stops the MCU.
     fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
         let Some(Back { result, .. }) = self.transfer.back(finished) else { return Ok(()) };
-        let result = result.map_err(BusError::clone);
+        let mut result = result.map_err(BusError::clone);
         let Some(transfer) = self.transfer.here() else { return Ok(()) };
+        if let Some((tolerance, answers)) = &mut self.tolerance {
+            match &mut result {
+                Ok(()) => {
+                    answers.keep(transfer);
+                    tolerance.works(context, KIND, I2C_NACK);
+                }
+                Err(error) if !answers.repeat(transfer) => {
+                    error.trouble.remedy = Some("tolerate is only for a device that is read".into());
+                }
+                Err(error) => {
+                    if tolerance.bears(context, KIND, |context| i2c_shutdown(context, error.clone())) {
+                        result = Ok(());
+                    }
+                }
+            }
+        }
         let response = transfer.response();
         match (transfer.purpose, &result) {
             (Purpose::Transfer, result) => {
@@ -268,7 +344,7 @@ impl Object for I2c {
         if let Purpose::Transfer = transfer.purpose {
             if !failed_before {
                 let trouble = i2c_shutdown(context, error);
-                context.warn(self.kind(), trouble);
+                context.warn(KIND, trouble);
             }
             return Ok(());
         }
@@ -277,11 +353,16 @@ impl Object for I2c {
             context.takes(&CONFIG_I2C_WITH_BUS) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
         let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
         let failure = self.failure(context, writing, error);
-        context.device_failed(self.kind(), failure)
+        context.device_failed(KIND, failure)
     }
 
     fn bus(&self) -> Option<&Bus> {
         self.bus.as_ref()
+    }
+
+    fn report(&self) -> Report {
+        let repeats = self.tolerance.as_ref().is_some_and(|(tolerance, _)| tolerance.is_used());
+        Report { repeats, ..Report::default() }
     }
 }
 

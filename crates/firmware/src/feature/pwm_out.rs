@@ -96,7 +96,7 @@ impl Object for PwmOut {
     }
 
     fn report(&self) -> Report {
-        Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)) }
+        Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)), ..Report::default() }
     }
 
     fn counts(&self) -> Option<BusCounts> {

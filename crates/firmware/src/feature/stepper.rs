@@ -341,7 +341,7 @@ impl Object for Stepper {
 
     fn report(&self) -> Report {
         let position = self.position().wrapping_sub(POSITION_BIAS) as i32;
-        Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
+        Report { queued: self.queue.len(), value: Some(Present::Steps(position)), ..Report::default() }
     }
 }
 

@@ -117,6 +117,8 @@ pub struct Report {
     pub queued: usize,
     /// Its present value.
     pub value: Option<Present>,
+    /// Whether its device fails and its last answers are repeated.
+    pub repeats: bool,
 }
 
 /// An object's present value.

@@ -41,4 +41,5 @@ mod spi_angle;
 mod stepper;
 mod thermocouple;
 mod tmcuart;
+mod tolerance;
 mod trigger_analog;

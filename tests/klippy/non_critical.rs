@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Kalico goes on while an MCU with `is_non_critical: True` is away. The checkout is `KLIPPER_DIR_KALICO`.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use pinion_firmware::mcu::DialectName;
+
+use super::hosts;
+use super::klippy::{Printer, pinion_path, without};
+
+/// Another Pinion, which is no part of the printer.
+struct Room(Child);
+
+impl Room {
+    fn start(folder: &Path) -> Room {
+        let pinion = Command::new(pinion_path())
+            .args(["run", "--board", "sim", "-I"])
+            .arg(folder.join("room"))
+            .stdout(Stdio::null())
+            .stderr(File::options().append(true).create(true).open(folder.join("room.log")).unwrap())
+            .spawn();
+        Room(pinion.unwrap())
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.0.id() as i32), signal).unwrap();
+    }
+
+    /// Ends it by this signal.
+    fn end(mut self, signal: Signal) {
+        self.signal(signal);
+        self.0.wait().unwrap();
+    }
+}
+
+fn until_away(printer: &mut Printer, is_away: bool) {
+    printer.until_object("mcu room", "non_critical_disconnected", is_away);
+}
+
+#[test]
+fn kalico_prints_on_while_a_non_critical_mcu_is_away() {
+    let Some(checkout) = hosts::checkout(DialectName::Kalico) else { return };
+    let mut printer = Printer::start_on(
+        &checkout,
+        |board, _| board,
+        |config| {
+            let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
+            let config = without(&without(&config, "load_cell ads1220"), "load_cell");
+            let serial = config.lines().find_map(|line| line.strip_prefix("serial: ")).unwrap();
+            let room = serial.strip_suffix("/tty").unwrap();
+            config.clone()
+                + &format!("\n[mcu room]\nserial: {room}/room\nis_non_critical: True\n")
+                + "\n[output_pin lamp]\npin: room:light\n"
+        },
+    );
+    // klippy is there first.
+    printer.until_state("ready");
+    let folder = printer.path("");
+    let mut room = Room::start(&folder);
+    until_away(&mut printer, false);
+    printer.gcode("G28\nSET_PIN PIN=lamp VALUE=1");
+    for signal in [Signal::SIGKILL, Signal::SIGTERM] {
+        room.end(signal);
+        until_away(&mut printer, true);
+        printer.gcode("G1 X40 Y30 Z8 F6000\nG1 X60 Y45\nM400");
+        room = Room::start(&folder);
+        until_away(&mut printer, false);
+        printer.gcode("SET_PIN PIN=lamp VALUE=1\nG1 X50\nM400");
+        assert_eq!(printer.state(), "ready", "{signal}");
+    }
+    // It hangs for longer than its guardian waits. The guardian ends it, and it is started again.
+    room.signal(Signal::SIGSTOP);
+    until_away(&mut printer, true);
+    printer.gcode("G1 X40 Y30\nM400");
+    room.end(Signal::SIGKILL);
+    room = Room::start(&folder);
+    until_away(&mut printer, false);
+    printer.gcode("SET_PIN PIN=lamp VALUE=1");
+    assert_eq!(printer.state(), "ready");
+    room.end(Signal::SIGTERM);
+}
