@@ -312,7 +312,7 @@ mod tests {
         // This klippy is another instance's host.
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
         says(&look(), "dialect", Ok, "it gets the messages that it looks up");
-        tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_adxl345 oid=%c wings=%u\")\n");
-        says(&look(), "dialect", Error, "query_adxl345 oid wings");
+        tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_ads1220 oid=%c wings=%u\")\n");
+        says(&look(), "dialect", Error, "for ADS1220 load cells: query_ads1220 oid wings");
     }
 }

@@ -194,7 +194,7 @@ pub struct Object {
     /// Its value now, if it has one.
     pub value: Option<Present>,
     /// Its device fails, and its last answers are repeated.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub repeats: bool,
     /// Transfers to its chip, if it has one on a bus.
     pub bus: Option<BusCounts>,
