@@ -25,6 +25,7 @@ mod months;
 mod neopixel;
 mod older_hosts;
 mod one_order;
+mod other_hosts;
 mod pca9685;
 mod plain_board;
 mod pwm_out;

@@ -87,9 +87,11 @@ impl Checkout {
             let of_linux = Sources::of_firmware(&folder.join("src"));
             shapes.retain(|shape| messages.contains(shape.name()) || of_linux.contains(shape));
         }
+        // A host names an enumeration by a parameter, too.
+        let parameters: HashSet<&str> = shapes.iter().flat_map(Shape::parameters).collect();
         let looks_up = |entry: &Entry| match Shape::of(entry.text) {
             Some(shape) if entry.is_message() => shapes.contains(&shape),
-            _ => words.contains(entry.name) || shapes.iter().any(|shape| shape.has(entry.name)),
+            _ => words.contains(entry.name) || parameters.contains(entry.name),
         };
         let forms = HostForms::new(&entries, looks_up);
         Ok(Checkout { commit: commit(&folder), folder, newest, unread, forms, shapes })
@@ -213,7 +215,7 @@ mod tests {
         let checkout = Checkout::read(&klippy, FEATURES).unwrap();
         assert_eq!(missing(&checkout), []);
         let [query] = &served(&checkout, "query_analog_in")[..] else { panic!() };
-        assert!(query.has("bytes_per_report"), "{query:?}");
+        assert!(query.parameters().any(|name| name == "bytes_per_report"), "{query:?}");
         assert_eq!(served(&checkout, "i2c_transfer").len(), 1);
         // klippy uses it if it exists.
         assert_eq!(served(&checkout, "i2c_read"), []);
@@ -241,6 +243,26 @@ mod tests {
         let missing = checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES);
         assert_eq!(names(&missing), "config_new_chip oid bus_oid; query_adxl345 oid rest_ticks range");
         assert_eq!(parts_without(&missing), "ADXL345 accelerometers");
+    }
+
+    #[test]
+    fn a_hostile_checkout_has_no_more_forms_than_there_is_room_for() {
+        let ours = forms(DialectName::Master);
+        let many = (0..20_000).map(|n| format!("query_adxl345 oid rest_ticks hostile_{n}"));
+        let long = format!("config_adxl345 {}", "oid ".repeat(500));
+        let names_of_others = (0..20_000).map(|n| format!("hostile_{n} oid"));
+        for hostile in [many.collect::<Vec<_>>(), names_of_others.collect(), vec![long.trim().to_owned()]] {
+            let (folder, klippy) = checkout(ours.iter().cloned());
+            let (_other, more) = checkout(hostile);
+            fs::copy(more.join("extras/all.py"), klippy.join("extras/hostile.py")).unwrap();
+            fs::create_dir(folder.path().join("src")).unwrap();
+            fs::copy(more.join("extras/all.py"), folder.path().join("src/hostile.c")).unwrap();
+            let Ok(checkout) = Checkout::read(&klippy, FEATURES) else { continue };
+            assert!(checkout.shapes.len() <= 10_000 && checkout.shapes.iter().all(|shape| shape.as_str().len() < 1000));
+            let missing = checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES);
+            assert!(names(&missing).len() < 11_000, "a line of the log");
+            assert!(checkout.forms.places().count() <= entries(FEATURES).len());
+        }
     }
 
     #[test]

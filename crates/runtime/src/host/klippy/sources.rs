@@ -24,6 +24,8 @@ const FILES_MAX: usize = 2000;
 const FILE_BYTES_MAX: u64 = 1 << 20;
 const BYTES_MAX: u64 = 32 << 20;
 const SHAPES_MAX: usize = 10_000;
+/// Longest message. klippy's have at most 150 bytes.
+const SHAPE_BYTES_MAX: usize = 1000;
 /// Highest depth of folders: klippy's own folder, `extras`, and packages in there.
 const DEPTH_MAX: usize = 3;
 
@@ -67,9 +69,9 @@ impl Shape {
         self.0.split(' ').next().unwrap_or_default()
     }
 
-    /// Whether it has a parameter of this name.
-    pub fn has(&self, parameter: &str) -> bool {
-        self.0.split(' ').skip(1).any(|name| name == parameter)
+    /// The names of its parameters.
+    pub fn parameters(&self) -> impl Iterator<Item = &str> {
+        self.0.split(' ').skip(1)
     }
 
     /// Name and parameters, for people.
@@ -202,7 +204,7 @@ impl Sources {
         self.newest = self.newest.max(metadata.modified()?);
         // Most files have no message, and need not be read as Python.
         if text.windows(2).any(|pair| pair == b"=%" || pair == b"={") {
-            strings(&text, |string| match Shape::of(string) {
+            strings(&text, |string| match Shape::of(string).filter(|_| string.len() <= SHAPE_BYTES_MAX) {
                 Some(shape) if self.shapes.len() < SHAPES_MAX => {
                     self.shapes.insert(shape);
                 }
