@@ -37,7 +37,8 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package test-bare soak soak-real fuzz coverage mutants
+.PHONY: help run demo mainsail test test-all test-programs test-drivers test-slow test-kernel test-raspberry-pi test-package test-bare
+.PHONY: figures klippy soak soak-real fuzz coverage mutants
 .PHONY: sanitize bench check build install install-program install-sim install-system uninstall deb release image clean
 
 # They install what is missing, Rust too.
@@ -50,8 +51,12 @@ help:
 	@echo 'make run           build, home and heat a simulated printer, then serve a real host until Ctrl-C'
 	@echo 'make demo          the same without serving; fails if anything shown was not right'
 	@echo 'make mainsail      the simulated printer with Klipper, Moonraker and Mainsail, until Ctrl-C (FOLDER=$(FOLDER))'
-	@echo 'make test          all tests, with those against real kernel drivers in a virtual machine'
-	@echo 'make test-kernel   only the latter'
+	@echo 'make test          the tests for each change, with those on real kernel drivers in a virtual machine'
+	@echo 'make test-all      all tests (tests/README.md): the former, make check and what takes long; as root also'
+	@echo '                   the package, and with KLIPPER_DIR=~/klipper a real klippy'
+	@echo 'make test-slow     tests of the program in which heaters and motors take their real time'
+	@echo 'make test-kernel   all tests on real kernel drivers, on two kernels'
+	@echo 'make figures       figures of the program in that virtual machine (docs/develop/performance.md)'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
 	@echo 'make test-bare     make run and make test in bare root folders of Debian 12 and 13 (as root; hours)'
 	@echo 'make test-raspberry-pi'
@@ -91,17 +96,49 @@ build: system-packages-build
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
+# The drivers and mocks themselves, and what sends a hundred thousand frames: `make test-kernel` has them.
+DRIVERS = --flavour stock --skip selftest:: --skip can::a_node_that_floods --skip can::a_node_that_takes_and_gives
 
+# Most tests of the programs wait, and most of those on drivers compute: both take hardly longer than one of them.
 test: system-packages-vm
-	'$(CARGO)' test --locked
+	'$(CARGO)' test --locked --no-run
 ifeq ($(shell uname -m),x86_64)
-	$(TEST_KERNEL)
+	'$(CARGO)' test --locked --no-run --test kernel --test kernel_guest
+	@$(MAKE) --no-print-directory -j2 test-programs test-drivers
 else
+	@$(MAKE) --no-print-directory test-programs
 	@echo 'NOT RUN: the tests in the virtual machine, which need an x86-64 computer' >&2
 endif
 
+test-programs:
+	'$(CARGO)' test --locked
+
+# Its lines would stand among those of the other tests.
+test-drivers:
+	@log=$$(mktemp) && status=0 && { $(TEST_KERNEL) -- $(DRIVERS) >"$$log" 2>&1 || status=$$?; } && \
+	    cat "$$log" && rm "$$log" && exit $$status
+
+# One after the other: each has its own times.
+test-all: check test test-slow test-kernel figures
+	@$(MAKE) --no-print-directory fuzz TOTAL=60
+	@if [ $$(id -u) = 0 ]; then $(MAKE) --no-print-directory test-package; \
+	else echo 'NOT RUN: make test-package, which takes root' >&2; fi
+	@$(MAKE) --no-print-directory klippy
+
+test-slow:
+	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::cut::
+	@# In real time, so that it would delay the others.
+	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::demonstration:: --test-threads=1
+
+klippy:
+	@if [ -n "$$KLIPPER_DIR" ]; then '$(CARGO)' test --locked --test klippy -- --test-threads=1; \
+	else echo 'NOT RUN: the tests with a real klippy, which take KLIPPER_DIR=~/klipper' >&2; fi
+
 test-kernel: system-packages-vm
 	$(TEST_KERNEL)
+
+figures: system-packages-vm
+	$(TEST_KERNEL) --release -- figures
 
 test-raspberry-pi: system-packages-build
 	'$(CARGO)' test --locked --test raspberry_pi

@@ -38,7 +38,7 @@ const FAILED: u8 = 101;
 const TESTS_IN_A_VM: usize = 32;
 
 /// Tests with figures that are compared with another run or another program. They have their own VM, so that their
-/// figures do not depend on earlier tests.
+/// figures do not depend on earlier tests. They take long, and run only if a filter asks for them.
 const FIGURES: &str = "figures::";
 
 /// Figures of a print with klippy.

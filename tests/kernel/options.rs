@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The command line.
 
-use super::cache_lines;
+use super::FIGURES;
 use super::guest_program::OtherProgram;
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::kernel::Flavour;
@@ -36,10 +36,6 @@ pub struct Options {
     pub shell: bool,
 }
 
-/// Figures that take long: a search for a rate, prints, messages of a UART, a count of cache lines. They run only if a
-/// filter asks for them, such as `figures`.
-const LONG: [&str; 4] = ["figures::most_steps", "figures::print", "figures::uart", cache_lines::TESTS];
-
 impl Options {
     /// Exits after an error, and for `--help`.
     pub fn from_args() -> Options {
@@ -64,6 +60,6 @@ impl Options {
     pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
         self.flavour.is_none_or(|only| only == flavour)
             && self.arguments.selects(name)
-            && (!LONG.iter().any(|long| name.contains(long)) || self.arguments.has_filter())
+            && (!name.contains(FIGURES) || self.arguments.has_filter())
     }
 }

@@ -59,7 +59,7 @@ pub struct Printer {
 /// The path of `pinion`, with `pinion-sim` beside it.
 pub fn pinion_path() -> &'static Path {
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
-    simulator::build_beside(pinion);
+    simulator::beside(pinion);
     pinion
 }
 

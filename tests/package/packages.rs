@@ -18,7 +18,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
     // The program that cargo has built for all tests.
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
     strip(pinion, "pinion")?;
-    strip(simulator::build_beside(pinion), "pinion-sim")?;
+    strip(simulator::beside(pinion), "pinion-sim")?;
     strip(&host(tree)?, "host")?;
     process::run(
         Command::new(tree.join("scripts/build-deb"))

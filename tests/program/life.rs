@@ -6,8 +6,7 @@ use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
 use std::process::Stdio;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use nix::fcntl::{AT_FDCWD, FcntlArg, FdFlag, OFlag, fcntl};
 use nix::pty::openpty;
@@ -215,7 +214,7 @@ fn sigterm_informs_the_host_and_drives_outputs_to_their_shutdown_values() {
     client.link().settle().unwrap();
     pinion.signal(Signal::SIGTERM);
     // The terminal stays open until the host has read the news, even if the host is busy for a moment.
-    thread::sleep(Duration::from_millis(300));
+    pinion.logged("shutdown: Force shutdown command: ");
     assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
     drop(client);
     assert_eq!(pinion.end().code(), Some(0));

@@ -17,8 +17,8 @@ use pinion_client::serial::{BlockLink, Port};
 use pinion_testkit::wait;
 use tempfile::TempDir;
 
-use crate::cut::begin;
 use crate::process::{Pinion, WAIT_MAX, pinion_path};
+use crate::slow::cut::begin;
 use crate::terminal::AtTerminal;
 
 /// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
@@ -129,7 +129,8 @@ fn a_link_that_run_refuses_is_an_error_of_the_check() {
     let file = format!("serial:{}", file.display());
     for link in [&*file, &folder_itself, "serial:/dev/null", "can:lo,0123456789ab"] {
         let run = |more: &[&str]| {
-            let args = [&["run", "--board", "sim", "--link", link, "-I", "/tmp/klipper_host_refused"], more].concat();
+            let own = folder.path().join("klipper_host_refused");
+            let args = [&["run", "--board", "sim", "--link", link, "-I", own.to_str().unwrap()], more].concat();
             Command::new(pinion_path()).args(args).stdin(Stdio::null()).output().unwrap()
         };
         let (refused, checked) = (run(&[]), run(&["--check"]));

@@ -9,7 +9,6 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
-use std::thread;
 use std::time::Instant;
 
 use nix::sys::signal::Signal;
@@ -22,6 +21,9 @@ use serde_json::{Value, json};
 use crate::process::{Pinion, WAIT_MAX, as_nobody, exists, pinion_path, printed, program_in};
 use crate::terminal::AtTerminal;
 
+/// An answer of a stopped MCU.
+const RECORDED: &[u8] = include_bytes!("../../crates/runtime/src/status/recorded.json");
+
 pub fn socket(pinion: &Pinion) -> PathBuf {
     pinion.link().with_file_name("tty.sock")
 }
@@ -31,10 +33,16 @@ fn ask(pinion: &Pinion, args: &[&str]) -> std::process::Output {
     Command::new(pinion_path()).arg("status").args(args).arg("-I").arg(link).output().unwrap()
 }
 
+/// The whole state. An answer comes without the MCU's part if the core takes over a second for it.
 pub fn status(pinion: &Pinion) -> Value {
-    let output = ask(pinion, &["--json"]);
-    assert!(output.status.success(), "{output:?}\n{}", pinion.log());
-    serde_json::from_slice(&output.stdout).unwrap()
+    let socket = socket(pinion);
+    let answer = || {
+        let mut text = String::new();
+        UnixStream::connect(&socket).ok()?.read_to_string(&mut text).ok()?;
+        let status: Value = serde_json::from_str(&text).ok()?;
+        status["objects"].is_array().then_some(status)
+    };
+    wait::until_some(answer, || format!("an answer of {}; the log:\n{}", socket.display(), pinion.log()))
 }
 
 pub fn line<'a>(status: &'a Value, pin: &str) -> &'a Value {
@@ -336,11 +344,17 @@ fn a_crowd_is_waited_for_and_then_named() {
         "{log}"
     );
     let waiting = ask();
-    thread::sleep(std::time::Duration::from_millis(200));
+    // It sleeps between its tries, and hardly before them.
+    let switches = || {
+        let status = fs::read_to_string(format!("/proc/{}/status", waiting.id())).unwrap();
+        let count = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:")).unwrap();
+        count.trim().parse::<u32>().unwrap()
+    };
+    wait::until("some tries", || switches() >= 20);
     for _ in 0..=crowd.len() {
         let (mut client, _) = listener.accept().unwrap();
         // The crowd does not read.
-        let _ = client.write_all(include_bytes!("../../crates/runtime/src/status/recorded.json"));
+        let _ = client.write_all(RECORDED);
     }
     let answered = waiting.wait_with_output().unwrap();
     let page = String::from_utf8_lossy(&answered.stdout);
@@ -384,11 +398,20 @@ fn a_terminal_that_is_gone_ends_it() {
 
 #[test]
 fn a_terminal_that_takes_no_output_does_not_keep_it_from_its_end() {
-    let pinion = Pinion::simulated(&[]);
-    let mut watch = watch_at_terminal(&pinion);
-    // As with Ctrl-S. The next page, a second later, finds no room.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mcu.sock");
+    let listener = UnixListener::bind(&path).unwrap();
+    let answer = || {
+        let (mut client, _) = listener.accept().unwrap();
+        client.write_all(RECORDED).unwrap();
+    };
+    let mut command = Command::new(pinion_path());
+    let mut watch = AtTerminal::start(command.args(["status", "--watch", "--socket"]).arg(&path), 40, None);
+    answer();
+    watch.until("q ends");
+    // As with Ctrl-S. The next page finds no room.
     tcflow(watch.slave(), FlowArg::TCOOFF).unwrap();
-    thread::sleep(std::time::Duration::from_millis(1500));
+    answer();
     watch.signal(Signal::SIGTERM);
     assert_eq!(watch.ended().signal(), Some(Signal::SIGTERM as i32));
     assert!(watch.is_given_back());

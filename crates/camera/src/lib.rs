@@ -17,4 +17,4 @@ mod server;
 mod studio;
 
 pub use picture::{Layout, Picture};
-pub use server::{STREAMS_MAX, serve};
+pub use server::{Limits, STREAMS_MAX, serve};

@@ -31,12 +31,7 @@ const CONNECTIONS_MAX: usize = 64;
 /// Longest request, in bytes, and most headers in it.
 const REQUEST_MAX: usize = 8 * 1024;
 const HEADERS_MAX: usize = 64;
-/// How long a request may take to arrive.
-const REQUEST_TIME: Duration = Duration::from_secs(5);
-/// How long a viewer may take for an answer or a frame.
-const ANSWER_TIME: Duration = Duration::from_secs(5);
-/// How long what a client still sends is read after an answer, and how much of it.
-const FAREWELL_TIME: Duration = Duration::from_millis(500);
+/// How much of what a client still sends is read after an answer.
 const FAREWELL_MAX: usize = 256 * 1024;
 /// How much the kernel keeps for a slow viewer: some frames. A larger buffer would show old pictures.
 const SEND_BUFFER: usize = 128 * 1024;
@@ -69,6 +64,23 @@ img { display: block; width: 100vw; height: 100vh; height: 100dvh; object-fit: c
 </html>
 ";
 
+/// How long a client may keep a connection waiting.
+#[derive(Clone, Copy)]
+pub struct Limits {
+    /// Longest time until a request has arrived.
+    pub request: Duration,
+    /// Longest time until a viewer has taken an answer or a frame.
+    pub answer: Duration,
+    /// Longest time for which the server reads after an answer.
+    pub farewell: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { request: Duration::from_secs(5), answer: Duration::from_secs(5), farewell: Duration::from_millis(500) }
+    }
+}
+
 /// Shows this printer to everybody who connects. `look` returns the scene to draw; it is called for each frame, and
 /// only while somebody waits for one. All threads get the calling thread's priority.
 ///
@@ -78,6 +90,7 @@ img { display: block; width: 100vw; height: 100vh; height: 100dvh; object-fit: c
 pub fn serve(
     listener: &TcpListener,
     printer: Printer,
+    limits: Limits,
     look: impl FnMut() -> Scene + Send + 'static,
 ) -> io::Result<std::convert::Infallible> {
     // [::ffff:127.0.0.1] is 127.0.0.1.
@@ -93,7 +106,7 @@ pub fn serve(
             thread::sleep(PAUSE);
             continue;
         };
-        let connection = Connection { stream, studio: studio.clone(), streams: streams.clone(), is_local };
+        let connection = Connection { stream, studio: studio.clone(), streams: streams.clone(), is_local, limits };
         let viewer = move || {
             // Nobody misses an answer to a viewer that is gone.
             let _ = connection.answer();
@@ -176,6 +189,7 @@ struct Connection {
     streams: Arc<Places>,
     /// Whether only this computer can connect.
     is_local: bool,
+    limits: Limits,
 }
 
 impl Connection {
@@ -275,7 +289,7 @@ impl Connection {
 
     /// Writes all of it, or fails when its time is over.
     fn write(&self, mut bytes: &[u8]) -> io::Result<()> {
-        let end = Instant::now() + ANSWER_TIME;
+        let end = Instant::now() + self.limits.answer;
         while !bytes.is_empty() {
             self.stream.set_write_timeout(Some(left_until(end)?))?;
             match (&self.stream).write(bytes) {
@@ -290,7 +304,7 @@ impl Connection {
 
     /// Reads a request. `None` if the client goes without one.
     fn request(&self) -> io::Result<Option<Result<Request, Refusal>>> {
-        let end = Instant::now() + REQUEST_TIME;
+        let end = Instant::now() + self.limits.request;
         let (mut bytes, mut length) = ([0; REQUEST_MAX], 0);
         loop {
             let Ok(left) = left_until(end) else { return Ok(Some(Err(TIMEOUT))) };
@@ -316,7 +330,7 @@ impl Connection {
     /// would lose the answer.
     fn farewell(&self) -> io::Result<()> {
         self.stream.shutdown(Shutdown::Write)?;
-        let end = Instant::now() + FAREWELL_TIME;
+        let end = Instant::now() + self.limits.farewell;
         let (mut bytes, mut read) = ([0; 4096], 0);
         while read < FAREWELL_MAX {
             self.stream.set_read_timeout(Some(left_until(end)?))?;

@@ -9,7 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use pinion_camera::scene::{Bed, Gantry, Printer, Scene};
-use pinion_camera::{STREAMS_MAX, serve};
+use pinion_camera::{Limits, STREAMS_MAX, serve};
 
 /// Timeout of a test: long enough for any computer.
 const WAIT_MAX: Duration = Duration::from_secs(60);
@@ -22,10 +22,17 @@ struct Camera {
 
 impl Camera {
     fn start() -> Camera {
-        Camera::start_at("127.0.0.1:0")
+        // A busy computer makes no client too slow.
+        Camera::start_at("127.0.0.1:0", Limits { request: WAIT_MAX, answer: WAIT_MAX, ..Limits::default() })
     }
 
-    fn start_at(address: &str) -> Camera {
+    /// A camera that waits for no client.
+    fn impatient() -> Camera {
+        let short = Duration::from_millis(100);
+        Camera::start_at("127.0.0.1:0", Limits { request: short, answer: short, farewell: short })
+    }
+
+    fn start_at(address: &str, limits: Limits) -> Camera {
         let listener = TcpListener::bind(address).unwrap();
         let address = listener.local_addr().unwrap();
         let drawn = Arc::new(AtomicUsize::new(0));
@@ -36,7 +43,7 @@ impl Camera {
         };
         let bed = Bed::Rectangle { x_mm: [0.0, 220.0], y_mm: [0.0, 220.0] };
         let printer = Printer { bed, height_mm: 240.0, gantry: Gantry::Cartesian };
-        thread::spawn(move || serve(&listener, printer, look));
+        thread::spawn(move || serve(&listener, printer, limits, look));
         Camera { address, drawn }
     }
 
@@ -235,7 +242,7 @@ fn nothing_is_drawn_while_nobody_looks() {
     };
     until("the end of the drawing", calm);
     camera.get("/snapshot");
-    assert!(calm());
+    until("the end of the drawing after a snapshot", calm);
 }
 
 #[test]
@@ -269,21 +276,19 @@ fn everything_else_is_refused_in_plain_words() {
 
 #[test]
 fn a_request_without_an_end_is_given_up() {
-    let camera = Camera::start();
-    let start = Instant::now();
+    let camera = Camera::impatient();
     let (head, _) = camera.answer("GET / HTT");
     assert!(head.starts_with("HTTP/1.1 408 Request Timeout\r\n"), "{head}");
-    assert!(start.elapsed() >= Duration::from_secs(4));
 }
 
 #[test]
 fn a_request_that_comes_letter_by_letter_is_given_up() {
-    let camera = Camera::start();
+    let camera = Camera::impatient();
     let mut slow = camera.sent("GET /");
     let start = Instant::now();
     while slow.write_all(b"x").is_ok() {
         assert!(start.elapsed() < WAIT_MAX, "it is read for ever");
-        thread::sleep(Duration::from_millis(100));
+        thread::sleep(Duration::from_millis(10));
     }
 }
 
@@ -300,7 +305,7 @@ fn pages_of_the_internet_cannot_read_what_is_for_this_computer() {
         assert!(head.starts_with("HTTP/1.1 200 OK") && !head.contains("Access-Control-Allow-Origin"), "{head}");
     }
     // The user has chosen to show it to others.
-    let camera = Camera::start_at("0.0.0.0:0");
+    let camera = Camera::start_at("0.0.0.0:0", Limits::default());
     let (head, _) = camera.answer(&request("https://printer.example"));
     assert!(head.contains("Access-Control-Allow-Origin: *\r\n"), "{head}");
     let (head, _) = camera.answer("GET /snapshot HTTP/1.1\r\nHost: printer.example\r\n\r\n");
@@ -313,13 +318,10 @@ fn a_slow_viewer_loses_frames_and_holds_nobody_up() {
     let mut slow = camera.watch();
     slow.frame();
     let mut quick = camera.watch();
-    let before = camera.drawn();
+    // The slow one takes nothing. While the quick one gets a frame, nobody waits for the slow one.
     for _ in 0..30 {
         assert_jpeg(&quick.frame());
     }
-    // The quick one gets each frame, or nearly so on a busy computer.
-    let drawn = camera.drawn() - before;
-    assert!(drawn < 60, "{drawn}");
     // The slow one has some in the kernel's buffers. The pictures after these are new.
     let backlog = (0..1000).take_while(|_| {
         let start = Instant::now();
@@ -331,7 +333,8 @@ fn a_slow_viewer_loses_frames_and_holds_nobody_up() {
 
 #[test]
 fn a_viewer_that_takes_nothing_is_given_up() {
-    let camera = Camera::start();
+    let answer = Duration::from_secs(2);
+    let camera = Camera::start_at("127.0.0.1:0", Limits { request: WAIT_MAX, answer, ..Limits::default() });
     let _stuck: Vec<Viewer> = (0..STREAMS_MAX).map(|_| camera.watch()).collect();
     assert!(camera.get("/stream").0.starts_with("HTTP/1.1 503 "));
     // A snapshot needs no place among the streams.

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use pinion_camera::scene::{
     Axis, Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Printer, Probe, Rgb, Scene, Servo, Strip,
 };
-use pinion_camera::{Layout, Picture};
+use pinion_camera::{Layout, Limits, Picture};
 use pinion_firmware::time::CLOCK_FREQ;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
@@ -125,7 +125,7 @@ impl Camera {
                     thread::sleep(READ_PERIOD);
                 }
             });
-            let Err(error) = thread.and_then(|_| pinion_camera::serve(&listener, printer, look));
+            let Err(error) = thread.and_then(|_| pinion_camera::serve(&listener, printer, Limits::default(), look));
             log::error!("the camera shows nothing: {error}: free memory, or raise ulimit -u, and start again");
         });
         pinion_runtime::started(thread)?;

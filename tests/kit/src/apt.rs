@@ -70,10 +70,15 @@ impl Apt {
         if matches!(age, Ok(Ok(age)) if age < LISTS_AGE_MAX) {
             return Ok(());
         }
-        self.update().or_else(|cause| {
-            eprintln!("the known packages of {} are used: {cause}", self.of);
-            Ok(())
-        })
+        let Err(cause) = self.update() else { return Ok(()) };
+        // apt's own words, without the whole command.
+        let why = cause.lines().find(|line| line.starts_with("E: ")).unwrap_or(&cause);
+        let away = format!("Debian's archives for {} cannot be reached ({why})", self.of);
+        if !self.stamp().exists() {
+            return Err(format!("{away}: connect to a network, or correct /etc/apt/sources.list"));
+        }
+        eprintln!("{away}: the packages that were known before are used");
+        Ok(())
     }
 
     /// Updates the lists now.

@@ -21,6 +21,10 @@ use super::{describe, process, tools};
 /// computers can be compared.
 const RELEASE: &str = "bookworm";
 
+/// The kernels that were tested last. Debian offers them for some months after the next ones, which are used when it
+/// does so no longer.
+const PINNED: &str = "6.1.0-56";
+
 /// Debian's kernels on which Pinion runs.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Flavour {
@@ -42,11 +46,11 @@ impl Flavour {
         }
     }
 
-    /// The package that always depends on the newest kernel.
-    fn package(self) -> &'static str {
+    /// The end of its packages' names.
+    fn suffix(self) -> &'static str {
         match self {
-            Flavour::Stock => "linux-image-amd64",
-            Flavour::Rt => "linux-image-rt-amd64",
+            Flavour::Stock => "amd64",
+            Flavour::Rt => "rt-amd64",
         }
     }
 }
@@ -163,9 +167,8 @@ impl Kernel {
 
     /// Makes everything that the cache does not contain yet. The caller has its lock.
     pub fn prepare(flavour: Flavour, offers: &Offers, cache: &Cache) -> Result<Kernel, String> {
-        let newest = offers.newest(flavour)?;
-        let release = newest.dependency("linux-image-")?.replace("linux-image-", "");
-        let version = newest.field("Version")?;
+        let release = offers.release(flavour)?;
+        let version = offers.version(&release)?;
         let of_version = cache.root().join(format!("linux-{version}"));
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("modules");
         let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
@@ -179,18 +182,15 @@ impl Kernel {
     }
 }
 
-/// The newest kernels of Debian 12.
+/// The kernels of Debian 12.
 pub struct Offers {
     apt: Apt,
-    packages: Vec<Fields>,
 }
 
 impl Offers {
     /// Asks apt for them. The caller has the cache's lock.
     pub fn ask(cache: &Cache) -> Result<Offers, String> {
-        let apt = Apt::open(&cache.root().join("apt"), "amd64", Some(RELEASE))?;
-        let packages = Fields::of(&apt, &Flavour::ALL.map(Flavour::package))?;
-        Ok(Offers { apt, packages })
+        Apt::open(&cache.root().join("apt"), "amd64", Some(RELEASE)).map(|apt| Offers { apt })
     }
 
     /// Debian 12's archives, as a sources.list.
@@ -198,11 +198,22 @@ impl Offers {
         self.apt.sources()
     }
 
-    fn newest(&self, flavour: Flavour) -> Result<&Fields, String> {
-        self.packages
-            .iter()
-            .find(|fields| fields.field("Package").is_ok_and(|name| name == flavour.package()))
-            .ok_or_else(|| format!("apt offers no {}", flavour.package()))
+    /// The pinned kernel, or the newest one, as `uname -r` prints it.
+    fn release(&self, flavour: Flavour) -> Result<String, String> {
+        let pinned = format!("{PINNED}-{}", flavour.suffix());
+        if self.version(&pinned).is_ok() {
+            return Ok(pinned);
+        }
+        // It depends on the newest one.
+        let newest = Fields::of(&self.apt, &format!("linux-image-{}", flavour.suffix()))?;
+        let newest = newest.dependency("linux-image-")?.replace("linux-image-", "");
+        eprintln!("Debian offers Linux {pinned} no longer: the tests run on {newest}");
+        Ok(newest)
+    }
+
+    /// The version of a kernel's package.
+    fn version(&self, release: &str) -> Result<String, String> {
+        Fields::of(&self.apt, &format!("linux-image-{release}"))?.field("Version").map(str::to_owned)
     }
 }
 
@@ -219,7 +230,7 @@ struct Packages {
 impl Packages {
     fn of(apt: &Apt, release: &str) -> Result<Packages, String> {
         let headers = format!("linux-headers-{release}");
-        let fields = Fields::of(apt, &[&headers])?.pop().ok_or_else(|| format!("apt offers no {headers}"))?;
+        let fields = Fields::of(apt, &headers)?;
         let kbuild = fields.dependency("linux-kbuild-")?;
         // linux-compiler-gcc-12-x86 means gcc-12.
         let compiler = fields.dependency("linux-compiler-")?;
@@ -239,12 +250,10 @@ impl Packages {
 struct Fields(String);
 
 impl Fields {
-    fn of(apt: &Apt, packages: &[&str]) -> Result<Vec<Fields>, String> {
+    fn of(apt: &Apt, package: &str) -> Result<Fields, String> {
         let mut show = apt.command("apt-cache");
-        show.args(["show", "--no-all-versions"]).args(packages);
-        let text =
-            process::output(&mut show).map_err(|cause| format!("apt offers no {}: {cause}", packages.join(" or ")))?;
-        Ok(text.trim_end().split("\n\n").map(|stanza| Fields(stanza.to_owned())).collect())
+        show.args(["show", "--no-all-versions", package]);
+        process::output(&mut show).map(Fields).map_err(|cause| format!("apt offers no {package}: {cause}"))
     }
 
     fn field(&self, name: &str) -> Result<&str, String> {

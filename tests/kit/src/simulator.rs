@@ -1,40 +1,45 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The program `pinion-sim`. `pinion` starts it from its own folder, and for a test cargo builds only the programs of the
-//! test's package.
+//! The program `pinion-sim`. `pinion` starts it from its own folder.
 
-use std::env;
+use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::OnceLock;
+use std::time::SystemTime;
 
-use crate::process;
+/// A cargo command that tests several programs builds both of them. For `--test program` alone, cargo builds only the
+/// programs of that test's package.
+const REMEDY: &str = "run cargo test --locked --no-run --test pinion_sim";
 
-/// Has cargo build the program beside this `pinion`, once for a process. Returns its path.
+/// Returns the program's path, beside this `pinion`.
 ///
 /// # Panics
 ///
-/// cargo failed.
-pub fn build_beside(pinion: &Path) -> &'static Path {
+/// cargo has not built it since its sources have changed.
+pub fn beside(pinion: &Path) -> &'static Path {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     BUILT.get_or_init(|| {
         let program = pinion.with_file_name("pinion-sim");
-        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
-        cargo.current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
-        // As a part of all tests: with this package alone, its libraries would have other features, and be built again.
-        cargo.args(["test", "--locked", "--quiet", "--no-run", "--test", "pinion_sim"]);
-        // TARGET/[TRIPLE/]PROFILE/pinion
-        let folders: Vec<&str> = pinion.ancestors().skip(1).filter_map(|folder| folder.file_name()?.to_str()).collect();
-        match folders[0] {
-            "debug" => {}
-            profile => drop(cargo.args(["--profile", profile])),
+        let built = changed(&program).unwrap_or_else(|| panic!("there is no {}: {REMEDY}", program.display()));
+        let tree = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let crates = fs::read_dir(tree.join("crates")).expect("the tree is complete").flatten();
+        // No program contains this one.
+        let crates = crates.map(|entry| entry.path()).filter(|path| !path.ends_with("testbench"));
+        let newest = crates.chain([tree]).filter_map(|package| newest(&package.join("src"))).max();
+        if let Some((changed, file)) = newest.filter(|(changed, _)| *changed > built) {
+            let age = changed.duration_since(built).unwrap_or_default();
+            panic!("{} is {} s older than {}: {REMEDY}", program.display(), age.as_secs(), file.display());
         }
-        let mut target = pinion.ancestors().nth(2).expect("cargo's folder has folders");
-        if folders[1].matches('-').count() >= 2 && folders[1].contains("-linux") {
-            cargo.args(["--target", folders[1]]);
-            target = target.parent().expect("cargo's folder has folders");
-        }
-        process::run(cargo.arg("--target-dir").arg(target)).unwrap_or_else(|error| panic!("{error}"));
-        assert!(program.exists(), "cargo built no {}", program.display());
         program
     })
+}
+
+/// When the file was changed.
+fn changed(file: &Path) -> Option<SystemTime> {
+    fs::metadata(file).and_then(|about| about.modified()).ok()
+}
+
+/// The last changed file of a folder.
+fn newest(folder: &Path) -> Option<(SystemTime, PathBuf)> {
+    let of = |path: PathBuf| if path.is_dir() { newest(&path) } else { changed(&path).map(|time| (time, path)) };
+    fs::read_dir(folder).ok()?.flatten().filter_map(|entry| of(entry.path())).max()
 }
