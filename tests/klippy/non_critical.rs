@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Kalico goes on while an MCU with `is_non_critical: True` is away. The checkout is `KLIPPER_DIR_KALICO`.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_firmware::mcu::DialectName;
+use pinion_testkit::wait;
 
 use super::hosts;
-use super::klippy::{Printer, pinion_path, without};
+use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, pinion_path, without};
 
 /// Another Pinion, which is no part of the printer.
 struct Room(Child);
@@ -37,8 +38,16 @@ impl Room {
     }
 }
 
-fn until_away(printer: &mut Printer, is_away: bool) {
-    printer.until_object("mcu room", "non_critical_disconnected", is_away);
+fn until_away(printer: &mut Printer) {
+    printer.until_object("mcu room", "non_critical_disconnected", true);
+}
+
+/// Waits until the host has configured it this many times.
+fn until_there(printer: &mut Printer, times: usize) {
+    let log = printer.path("room.log");
+    let configured = || fs::read_to_string(&log).unwrap().matches("configured: ").count();
+    wait::until("the configuration", || configured() >= times);
+    printer.until_object("mcu room", "non_critical_disconnected", false);
 }
 
 #[test]
@@ -55,30 +64,31 @@ fn kalico_prints_on_while_a_non_critical_mcu_is_away() {
             config.clone()
                 + &format!("\n[mcu room]\nserial: {room}/room\nis_non_critical: True\n")
                 + "\n[output_pin lamp]\npin: room:light\n"
+                + UNHOMED
         },
     );
     // klippy is there first.
     printer.until_state("ready");
     let folder = printer.path("");
     let mut room = Room::start(&folder);
-    until_away(&mut printer, false);
-    printer.gcode("G28\nSET_PIN PIN=lamp VALUE=1");
-    for signal in [Signal::SIGKILL, Signal::SIGTERM] {
+    until_there(&mut printer, 1);
+    printer.gcode(&format!("{WHERE_IT_STANDS}\nSET_PIN PIN=lamp VALUE=1"));
+    for (signal, times) in [(Signal::SIGKILL, 2), (Signal::SIGTERM, 3)] {
         room.end(signal);
-        until_away(&mut printer, true);
+        until_away(&mut printer);
         printer.gcode("G1 X40 Y30 Z8 F6000\nG1 X60 Y45\nM400");
         room = Room::start(&folder);
-        until_away(&mut printer, false);
+        until_there(&mut printer, times);
         printer.gcode("SET_PIN PIN=lamp VALUE=1\nG1 X50\nM400");
         assert_eq!(printer.state(), "ready", "{signal}");
     }
     // It hangs for longer than its guardian waits. The guardian ends it, and it is started again.
     room.signal(Signal::SIGSTOP);
-    until_away(&mut printer, true);
+    until_away(&mut printer);
     printer.gcode("G1 X40 Y30\nM400");
     room.end(Signal::SIGKILL);
     room = Room::start(&folder);
-    until_away(&mut printer, false);
+    until_there(&mut printer, 4);
     printer.gcode("SET_PIN PIN=lamp VALUE=1");
     assert_eq!(printer.state(), "ready");
     room.end(Signal::SIGTERM);

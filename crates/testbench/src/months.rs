@@ -41,10 +41,10 @@ fn hosts_of(repository: &'static str, months: &Value) -> Vec<Host> {
     for (entry, ranges) in months["entries"].as_object().unwrap() {
         for range in ranges.as_str().unwrap().split(',') {
             let (first, last) = range.split_once('-').unwrap();
-            for place in first.parse::<usize>().unwrap()..=last.parse().unwrap() {
-                let host = &mut hosts[place];
+            let (first, last): (usize, usize) = (first.parse().unwrap(), last.parse().unwrap());
+            hosts[first..=last].iter_mut().for_each(|host| {
                 host.entries.insert(entry.clone());
-            }
+            });
         }
     }
     hosts

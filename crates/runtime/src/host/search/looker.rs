@@ -122,7 +122,7 @@ impl Looker {
     /// Notes whether the process that has the terminal open is another than before. A process that only looks in while
     /// the host lives is none.
     fn meet(&mut self, process: &Process) {
-        let is_gone = self.before.as_ref().map(|before| is_gone(before));
+        let is_gone = self.before.as_ref().map(is_gone);
         self.is_other = is_gone == Some(true);
         if is_gone != Some(false) {
             self.before = Some(process.clone());
