@@ -5,8 +5,6 @@ use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
 use pinion_firmware::mcu::DialectName;
 use pinion_testkit::wait;
 
@@ -27,13 +25,9 @@ impl Room {
         Room(pinion.unwrap())
     }
 
-    fn signal(&self, signal: Signal) {
-        kill(Pid::from_raw(self.0.id() as i32), signal).unwrap();
-    }
-
-    /// Ends it by this signal.
-    fn end(mut self, signal: Signal) {
-        self.signal(signal);
+    /// kill -9.
+    fn kill(mut self) {
+        self.0.kill().unwrap();
         self.0.wait().unwrap();
     }
 }
@@ -63,7 +57,7 @@ fn kalico_prints_on_while_a_non_critical_mcu_is_away() {
             let room = serial.strip_suffix("/tty").unwrap();
             config.clone()
                 + &format!("\n[mcu room]\nserial: {room}/room\nis_non_critical: True\n")
-                + "\n[output_pin lamp]\npin: room:light\n"
+                + "\n[output_pin lamp]\npin: room:beeper\n"
                 + UNHOMED
         },
     );
@@ -73,23 +67,14 @@ fn kalico_prints_on_while_a_non_critical_mcu_is_away() {
     let mut room = Room::start(&folder);
     until_there(&mut printer, 1);
     printer.gcode(&format!("{WHERE_IT_STANDS}\nSET_PIN PIN=lamp VALUE=1"));
-    for (signal, times) in [(Signal::SIGKILL, 2), (Signal::SIGTERM, 3)] {
-        room.end(signal);
+    for times in [2, 3] {
+        room.kill();
         until_away(&mut printer);
         printer.gcode("G1 X40 Y30 Z8 F6000\nG1 X60 Y45\nM400");
         room = Room::start(&folder);
         until_there(&mut printer, times);
         printer.gcode("SET_PIN PIN=lamp VALUE=1\nG1 X50\nM400");
-        assert_eq!(printer.state(), "ready", "{signal}");
+        assert_eq!(printer.state(), "ready");
     }
-    // It hangs for longer than its guardian waits. The guardian ends it, and it is started again.
-    room.signal(Signal::SIGSTOP);
-    until_away(&mut printer);
-    printer.gcode("G1 X40 Y30\nM400");
-    room.end(Signal::SIGKILL);
-    room = Room::start(&folder);
-    until_there(&mut printer, 4);
-    printer.gcode("SET_PIN PIN=lamp VALUE=1");
-    assert_eq!(printer.state(), "ready");
-    room.end(Signal::SIGTERM);
+    room.kill();
 }
