@@ -392,6 +392,8 @@ fn only_the_callers_own_processes_count_beside_those_of_services_and_root() {
         let doctor = |uid: u32, sudo_uid: Option<&str>| {
             let mut doctor = Command::new(&program);
             doctor.args(["doctor", "--json"]).uid(uid).gid(uid).env_remove("SUDO_UID");
+            // Traces of other programs change meanwhile.
+            doctor.env("HOME", folder.path()).env_remove("XDG_STATE_HOME");
             sudo_uid.map(|uid| doctor.env("SUDO_UID", uid));
             let (_, _, findings) = parsed(&doctor.output().unwrap());
             // All findings except the state of the processors.
