@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dialect that the host speaks. It looks for the process that has the pty open, and for its sources.
+//! Finds the forms of messages that the host looks up. It looks for the process that has the pty open, and for its sources.
 //!
 //! That takes capabilities that open every file and every process of the computer. And it reads files that a host has
 //! written. So a process of its own does it, forked before the program has threads. That process keeps only these
 //! capabilities. Its only descriptor is the socket to the program. The kernel lets it read files and nothing more
-//! (`sys/filter.rs`). It gets a terminal's number. It answers with a dialect, the host that it found, and lines for the
+//! (`sys/filter.rs`). It gets a terminal's number. It answers with forms, the host that it found, and lines for the
 //! log. The program keeps none of those capabilities, and trusts no answer.
 //!
 //! This file is the program's side. `looker.rs` is the process. `message.rs` has the messages between them.
@@ -25,7 +25,7 @@ use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, recv, send, 
 use nix::sys::time::{TimeVal, TimeValLike as _};
 
 use crate::host::klippy::terminal::Terminal;
-use pinion_firmware::mcu::DialectName;
+use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
 
@@ -87,12 +87,25 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
     }
 }
 
+/// What the search found out about a host.
+pub(crate) struct Found {
+    /// The forms of messages for it.
+    pub(crate) forms: Forms,
+    /// The process of the host before is gone, and this is another one.
+    pub(crate) is_other: bool,
+}
+
+impl Found {
+    /// Nothing is known.
+    const NOTHING: Found = Found { forms: Forms::Dialect(DialectName::Union), is_other: false };
+}
+
 /// The link's way to the search. A thread receives the answers.
 pub(crate) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
     board: Arc<HostStatus>,
-    answers: Receiver<(u32, DialectName)>,
+    answers: Receiver<(u32, Found)>,
     /// The number of the last question.
     asked: u32,
 }
@@ -118,9 +131,9 @@ impl HostFinder {
                 for line in &answer.lines {
                     log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
                 }
-                let dialect = answer.dialect();
+                let found = Found { forms: answer.forms(), is_other: answer.is_other };
                 shown.found(answer.host);
-                let sent = sender.send((answer.number, dialect));
+                let sent = sender.send((answer.number, found));
                 wake.wake();
                 if sent.is_err() {
                     return;
@@ -133,7 +146,7 @@ impl HostFinder {
         Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
     }
 
-    /// Asks for the dialect of the host that came just now, on the terminal `device`.
+    /// Asks for the forms of the host that came just now, on the terminal `device`.
     pub(crate) fn ask(&mut self, device: Option<&Path>) {
         if let Some(Ok(terminal)) = device.map(Terminal::of) {
             self.terminal = terminal;
@@ -147,13 +160,13 @@ impl HostFinder {
     }
 
     /// The answer to the last question, if it has come.
-    pub(crate) fn answer(&self) -> Option<DialectName> {
+    pub(crate) fn answer(&self) -> Option<Found> {
         loop {
             match self.answers.try_recv() {
-                Ok((number, dialect)) if number == self.asked => return Some(dialect),
+                Ok((number, found)) if number == self.asked => return Some(found),
                 Ok(_) => {}
                 Err(TryRecvError::Empty) => return None,
-                Err(TryRecvError::Disconnected) => return Some(DialectName::Union),
+                Err(TryRecvError::Disconnected) => return Some(Found::NOTHING),
             }
         }
     }
