@@ -21,6 +21,8 @@ TMPFILESDIR ?= $(PREFIX)/lib/tmpfiles.d
 # udev does not look below /usr/local.
 UDEVDIR ?= $(if $(filter /usr,$(PREFIX)),/usr/lib/udev,/etc/udev)/rules.d
 MANDIR ?= $(PREFIX)/share/man
+# The pages that messages name.
+DOCDIR ?= $(PREFIX)/share/doc/pinion-mcu
 LIBDIR = $(PREFIX)/lib/pinion-mcu
 BASHDIR ?= $(PREFIX)/share/bash-completion/completions
 ZSHDIR ?= $(PREFIX)/share/zsh/site-functions
@@ -147,8 +149,10 @@ SUITES ?= bookworm trixie
 test-bare:
 	@for suite in $(SUITES); do scripts/bare $$suite || exit 1; done
 
+# Such as '--skip page' or 'upgrade' (docs/develop/test-package.md).
+CHECKS ?=
 test-package: system-packages-system
-	'$(CARGO)' test --locked --test package
+	'$(CARGO)' test --locked --test package -- $(CHECKS)
 
 SECONDS ?= 86400
 # Each run has its own faults. The test prints its seed if it fails.
@@ -222,6 +226,8 @@ install-program:
 	install -D -m 755 '$(PINION)' $(DESTDIR)$(PREFIX)/bin/pinion
 	install -D -m 644 man/pinion.1 $(DESTDIR)$(MANDIR)/man1/pinion.1
 	install -D -m 644 man/pinion-mcu.service.8 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+	install -d $(DESTDIR)$(DOCDIR)/guide
+	install -m 644 docs/guide/*.md $(DESTDIR)$(DOCDIR)/guide
 	install -D -m 755 systemd/link $(DESTDIR)$(LIBDIR)/link
 	install -D -m 755 systemd/usb-gadget $(DESTDIR)$(LIBDIR)/usb-gadget
 	install -D -m 644 systemd/can.conf $(DESTDIR)$(PREFIX)/share/pinion-mcu/can.conf
@@ -271,6 +277,7 @@ ifeq ($(DESTDIR),)
 	    systemctl disable --now $$unit; \
 	done
 endif
+	rm -rf $(DESTDIR)$(DOCDIR)/guide
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(PREFIX)/bin/pinion-sim $(DESTDIR)$(MANDIR)/man1/pinion-sim.1 \
 	    $(DESTDIR)$(BASHDIR)/pinion-sim $(DESTDIR)$(ZSHDIR)/_pinion-sim $(DESTDIR)$(FISHDIR)/pinion-sim.fish \
 	    $(DESTDIR)$(UNITDIR)/pinion-mcu.service \

@@ -20,6 +20,7 @@ use pinion_linux::foreign::word;
 use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::uart;
 use pinion_runtime::FIRMWARE;
+use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
 use pinion_runtime::realtime::{self, Processors};
 use pinion_runtime::{CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid, stdio_can_use};
 
@@ -181,6 +182,14 @@ fn link(symlink: &Path) -> Finding {
         };
         return Finding::error("symlink", obstacle, remedy);
     }
+    if !is_host_path(symlink) && !is_linked(symlink) {
+        let found = format!("{path}: klippy takes it for a serial port, because it does not begin with {HOST_PATHS}");
+        return Finding::warning(
+            "symlink",
+            found,
+            format!("-I {HOST_PATHS}NAME, or a link of that name that leads to it"),
+        );
+    }
     match fs::symlink_metadata(symlink) {
         Ok(_) if leads_to_ours(symlink) => {
             Finding::ok("symlink", format!("{path} is the service's link, which root puts in place for it"))
@@ -192,6 +201,13 @@ fn link(symlink: &Path) -> Finding {
         Ok(_) => Finding::ok("symlink", format!("{path} is a link, and will be replaced")),
         Err(_) => Finding::ok("symlink", format!("{path} can be made")),
     }
+}
+
+/// Whether klippy may find this path by another link: the service makes one to its own link.
+fn is_linked(symlink: &Path) -> bool {
+    let links = Computer::at(Path::new("/")).matching(format!("{HOST_PATHS}*"));
+    let is_service_s = symlink.starts_with("/run/pinion");
+    is_service_s || links.iter().any(|link| fs::read_link(link).is_ok_and(|target| target == symlink))
 }
 
 /// Whether a link leads into a folder of this user, as the service has it. klippy could not follow this user's own link
@@ -265,11 +281,19 @@ mod tests {
 
     #[test]
     fn a_link_can_be_made_where_nothing_else_stands() {
+        let own = Path::new("/tmp").join(format!("klipper_host_check{}", std::process::id()));
+        assert_eq!(link(&own).status, Level::Ok);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("tty");
+        // klippy would not find it, unless a link of the right name leads there.
+        let warned = link(&path);
+        assert_eq!(warned.status, Level::Warning);
+        assert!(warned.trouble.cause.ends_with("it does not begin with /tmp/klipper_host_"), "{warned:?}");
+        std::os::unix::fs::symlink(&path, &own).unwrap();
         assert_eq!(link(&path).status, Level::Ok);
         std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
         assert!(link(&path).trouble.cause.ends_with("is a link, and will be replaced"));
+        fs::remove_file(&own).unwrap();
         fs::remove_file(&path).unwrap();
         fs::write(&path, "").unwrap();
         let refused = link(&path);

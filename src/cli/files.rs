@@ -2,20 +2,21 @@
 //! The files that a command line names: to read, and to write.
 //!
 //! The files may come from anybody. Only regular files are opened, so no FIFO blocks and no device notices. An output
-//! replaces the file at its place when it is whole: a command that fails leaves the old file, or none.
+//! replaces the file at its place when it is whole: a command that fails leaves the old file, or none. A link of another
+//! user leads no output anywhere: root's command would change that user's choice of files.
 
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::fs::{self, File, Metadata, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use nix::fcntl::OFlag;
-use nix::unistd::{AccessFlags, access};
+use nix::unistd::{AccessFlags, access, geteuid};
 
 use pinion_linux::foreign;
-use pinion_linux::own_folder::below;
+use pinion_linux::own_folder::{PathEnd, below, end_of_path};
 
 const MIB: u64 = 1 << 20;
 /// How many names of a new file are tried.
@@ -53,7 +54,7 @@ pub fn read(path: &Path, mib_max: u64) -> io::Result<Vec<u8>> {
 pub struct Output {
     /// As the command line names it.
     path: PathBuf,
-    folder: File,
+    folder: OwnedFd,
     name: OsString,
     /// The permissions of the file that it replaces.
     mode: Option<u32>,
@@ -81,21 +82,15 @@ impl Output {
 
     /// The file without the symbolic links that lead to it, and what is there.
     fn find(path: &Path) -> io::Result<(Output, Option<Metadata>)> {
-        let place = |path: &Path, flags: OFlag| {
-            OpenOptions::new().read(true).custom_flags((flags | OFlag::O_PATH).bits()).open(path)
-        };
-        let (real, there) = match place(path, OFlag::empty()) {
-            Ok(file) => (fs::read_link(below(&file))?, Some(file.metadata()?)),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => (path.to_owned(), None),
-            Err(error) => return Err(error),
-        };
+        let PathEnd { folder, name, there } = end_of_path(path)?;
+        let there = there.map(|there| File::from(there).metadata()).transpose()?;
         if there.as_ref().is_some_and(|there| !there.is_file()) {
-            return Err(io::Error::other("it is no regular file"));
+            return Err(io::Error::other("it is not a regular file"));
         }
-        let folder = real.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let name = real.file_name().ok_or(io::ErrorKind::IsADirectory)?.to_owned();
-        let mode = there.as_ref().map(|there| there.mode() & 0o777);
-        let output = Output { path: path.to_owned(), folder: place(folder, OFlag::O_DIRECTORY)?, name, mode };
+        // Another user's file is replaced by ours. Its permissions are that user's choice.
+        let own = there.as_ref().filter(|there| there.uid() == geteuid().as_raw());
+        let mode = own.map(|there| there.mode() & 0o777);
+        let output = Output { path: path.to_owned(), folder, name, mode };
         access(&below(&output.folder), AccessFlags::W_OK | AccessFlags::X_OK)?;
         Ok((output, there))
     }
@@ -148,10 +143,12 @@ impl Output {
     ///
     /// One line with the file, the cause and the remedy.
     pub fn make(&self) -> Result<File, String> {
-        let mut options = OpenOptions::new();
-        let flags = OFlag::O_NONBLOCK | OFlag::O_NOFOLLOW;
-        options.write(true).create(true).truncate(true).custom_flags(flags.bits());
-        options.open(self.at(&self.name)).map_err(|error| unwritable(&self.path, &error))
+        let failed = |error: io::Error| unwritable(&self.path, &error);
+        let (name, file) = self.beside().map_err(failed)?;
+        fs::rename(self.at(&name), self.at(&self.name))
+            .inspect_err(|_| drop(fs::remove_file(self.at(&name))))
+            .map_err(failed)?;
+        Ok(file)
     }
 
     /// The file, as the command line names it.
@@ -168,7 +165,10 @@ fn unwritable(path: &Path, error: &io::Error) -> String {
 mod tests {
     use super::*;
     use std::io::Write;
-    use std::os::unix::fs::symlink;
+    use std::os::unix::fs::{lchown, symlink};
+
+    use nix::unistd::User;
+    use pinion_testkit::here;
 
     #[test]
     fn an_output_replaces_the_file_only_when_it_is_whole() {
@@ -220,13 +220,54 @@ mod tests {
         // A link in the file's place.
         fs::remove_file(&path).unwrap();
         symlink(&kept, &path).unwrap();
-        assert!(output.make().is_err());
-        assert_eq!(fs::read(&kept).unwrap(), b"old");
+        output.make().unwrap().write_all(b"made").unwrap();
+        assert_eq!((fs::read(&kept).unwrap(), fs::read(&path).unwrap()), (b"old".to_vec(), b"made".to_vec()));
         // A link in the folder's place.
         fs::rename(&folder, &moved).unwrap();
         symlink(&victim, &folder).unwrap();
         output.write(|out| out.write_all(b"new")).unwrap();
         assert_eq!((fs::read(&kept).unwrap(), fs::read(moved.join("a")).unwrap()), (b"old".to_vec(), b"new".to_vec()));
+    }
+
+    /// Root's command in a user's folder, where that user has put links and hard links.
+    #[test]
+    fn a_link_of_another_user_leads_no_output_anywhere() {
+        if !geteuid().is_root() {
+            return here::not_run("only root can make links for another user");
+        }
+        const MALLORY: u32 = 65_534;
+        let root = tempfile::tempdir().unwrap();
+        let [secret, folder] = ["secret", "folder"].map(|name| root.path().join(name));
+        fs::write(&secret, "root's").unwrap();
+        fs::create_dir(&folder).unwrap();
+        let own = |path: &Path| lchown(path, Some(MALLORY), Some(MALLORY)).unwrap();
+        own(&folder);
+        let links = ["file", "folder"].map(|name| folder.join(name));
+        symlink(&secret, &links[0]).unwrap();
+        symlink(root.path(), &links[1]).unwrap();
+        links.iter().for_each(|link| own(link));
+        let name = User::from_uid(MALLORY.into()).unwrap().map_or_else(|| MALLORY.to_string(), |user| user.name);
+        for path in [links[0].clone(), links[1].join("secret"), links[1].join("new")] {
+            let error = Output::check(&path, &[]).map(drop).unwrap_err();
+            let expected = format!("cannot be written: a link on the way to it belongs to another user, {name}: ");
+            assert!(error.contains(&expected), "{error}");
+        }
+        // A hard link is replaced, and gives its permissions to nobody.
+        let hard = folder.join("hard");
+        fs::hard_link(&secret, &hard).unwrap();
+        Output::check(&hard, &[]).unwrap().make().unwrap().write_all(b"new").unwrap();
+        let users = folder.join("users");
+        fs::write(&users, "").unwrap();
+        own(&users);
+        fs::set_permissions(&users, Permissions::from_mode(0o666)).unwrap();
+        Output::check(&users, &[]).unwrap().write(|out| out.write_all(b"new")).unwrap();
+        assert_eq!(fs::read(&secret).unwrap(), b"root's");
+        assert_eq!(fs::metadata(&users).unwrap().permissions().mode() & 0o022, 0);
+        // Links of our own are followed.
+        let link = root.path().join("link");
+        symlink(&secret, &link).unwrap();
+        Output::check(&link, &[]).unwrap().write(|out| out.write_all(b"new")).unwrap();
+        assert_eq!(fs::read(&secret).unwrap(), b"new");
     }
 
     #[test]
@@ -236,7 +277,7 @@ mod tests {
         File::create(&path).unwrap().set_len(2 * MIB).unwrap();
         assert_eq!(read(&path, 2).unwrap().len() as u64, 2 * MIB);
         assert_eq!(read(&path, 1).unwrap_err().to_string(), "it is longer than 1 MiB");
-        assert_eq!(read(Path::new("/dev/zero"), 1).unwrap_err().to_string(), "it is no regular file");
+        assert_eq!(read(Path::new("/dev/zero"), 1).unwrap_err().to_string(), "it is not a regular file");
         for path in ["/dev/null", "/nonexistent/a", "/"] {
             let error = Output::check(Path::new(path), &[]).map(drop).unwrap_err();
             assert!(error.starts_with(&format!("{path} cannot be written: ")), "{error}");

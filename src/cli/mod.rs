@@ -47,8 +47,8 @@ use simulator::take_over;
 /// The functions for the targets in `fuzz/`.
 #[cfg(fuzzing)]
 pub mod fuzz {
+    pub use super::computer::printer::printer_cfg;
     pub use super::config::config;
-    pub use super::doctor::printer_cfg;
     pub use super::status::status;
 }
 

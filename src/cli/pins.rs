@@ -5,8 +5,9 @@
 
 mod gather;
 mod text;
+mod used;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
@@ -16,6 +17,8 @@ use pinion_linux::Inventory;
 use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::sysfs::Sysfs;
 
+use super::complete::offering;
+use super::computer::board;
 use super::failed;
 use super::page::{Page, print};
 
@@ -25,6 +28,18 @@ pub(super) struct PinsArgs {
     /// Show only GPIO lines that no program holds
     #[arg(long)]
     pub free: bool,
+    /// Show who uses which line, bus, address or port, and where that is written
+    #[arg(long, conflicts_with = "free")]
+    pub used: bool,
+    /// With --used: write a picture of the header to this SVG file
+    #[arg(long, value_name = "FILE", requires = "used", value_hint = clap::ValueHint::FilePath)]
+    pub picture: Option<PathBuf>,
+    /// With --used: the board, if its device tree is not there, as on a mounted card
+    #[arg(long, value_name = "BOARD", requires = "used", value_parser = offering::<String>(&board::NAMES), hide_possible_values = true)]
+    pub board: Option<String>,
+    /// With --used: the system whose files are below DIR, for example a mounted card
+    #[arg(long, value_name = "DIR", requires = "used", default_value = "/", value_hint = clap::ValueHint::DirPath)]
+    pub root: PathBuf,
     /// Print JSON
     #[arg(long)]
     pub json: bool,
@@ -35,6 +50,9 @@ pub(super) struct PinsArgs {
 
 /// Prints the list.
 pub(super) fn run(args: &PinsArgs) -> ExitCode {
+    if args.used {
+        return used::run(args);
+    }
     let inventory = Inventory::scan();
     let sysfs = Sysfs::scan(Path::new("/"));
     let fast = |chip: &Chip| chip.registers(FastGpio::Auto).ok().map(|registers| registers.node().to_owned());

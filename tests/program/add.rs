@@ -16,12 +16,12 @@ use tempfile::TempDir;
 
 use crate::process::{output, pinion_path, program};
 
-const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
-const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
+pub(crate) const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
+pub(crate) const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
                            [stepper_y]\nposition_min: -5\nposition_max: 310\n\
                            #*# <---------------------- SAVE_CONFIG ---------------------->\n#*# [input_shaper]\n";
 /// The config.txt of Raspberry Pi OS 12.
-const CONFIG_TXT: &str = "\
+pub(crate) const CONFIG_TXT: &str = "\
 # For more options and information see
 # http://rptl.io/configtxt
 # Some settings may impact device functionality. See link above for details
@@ -82,10 +82,10 @@ const ARMBIAN_ENV: &str =
     "verbosity=1\nbootlogo=false\nconsole=both\noverlay_prefix=PREFIX\nrootdev=UUID=88c29f81\nrootfstype=ext4\n";
 
 /// A card with a board's system.
-struct Card(TempDir);
+pub(crate) struct Card(pub(crate) TempDir);
 
 impl Card {
-    fn of(model: &str, files: &[(&str, &str)]) -> Card {
+    pub(crate) fn of(model: &str, files: &[(&str, &str)]) -> Card {
         let card = Card(tempfile::tempdir().unwrap());
         card.put("proc/device-tree/model", &format!("{model}\0"));
         card.put(PRINTER, PRINTER_CFG);
@@ -94,21 +94,21 @@ impl Card {
         card
     }
 
-    fn pi() -> Card {
+    pub(crate) fn pi() -> Card {
         Card::of("Raspberry Pi 4 Model B Rev 1.4", &[("boot/firmware/config.txt", CONFIG_TXT)])
     }
 
-    fn path(&self, path: &str) -> PathBuf {
+    pub(crate) fn path(&self, path: &str) -> PathBuf {
         self.0.path().join(path)
     }
 
-    fn put(&self, path: &str, text: &str) {
+    pub(crate) fn put(&self, path: &str, text: &str) {
         let path = self.path(path);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, text).unwrap();
     }
 
-    fn read(&self, path: &str) -> String {
+    pub(crate) fn read(&self, path: &str) -> String {
         fs::read_to_string(self.path(path)).unwrap()
     }
 
@@ -121,13 +121,13 @@ impl Card {
             .collect()
     }
 
-    fn add(&self, args: &[&str]) -> Output {
+    pub(crate) fn add(&self, args: &[&str]) -> Output {
         let arguments = self.arguments(args);
         output(&arguments.iter().map(String::as_str).collect::<Vec<_>>())
     }
 
     #[track_caller]
-    fn added(&self, args: &[&str]) -> String {
+    pub(crate) fn added(&self, args: &[&str]) -> String {
         let output = self.add(args);
         let (out, log) =
             (String::from_utf8(output.stdout).unwrap(), String::from_utf8_lossy(&output.stderr).into_owned());
@@ -136,14 +136,14 @@ impl Card {
     }
 
     #[track_caller]
-    fn refused(&self, args: &[&str]) -> String {
+    pub(crate) fn refused(&self, args: &[&str]) -> String {
         let output = self.add(args);
         assert_eq!(output.status.code(), Some(1), "{output:?}");
         String::from_utf8_lossy(&output.stderr).into_owned()
     }
 
     /// All files, with their bytes and modes, and the folders.
-    fn snapshot(&self) -> Vec<(PathBuf, Vec<u8>, u32)> {
+    pub(crate) fn snapshot(&self) -> Vec<(PathBuf, Vec<u8>, u32)> {
         let mut found = Vec::new();
         let mut folders = vec![self.0.path().to_owned()];
         while let Some(folder) = folders.pop() {
@@ -157,8 +157,6 @@ impl Card {
                 found.push((path, bytes, about.mode()));
             }
         }
-        // The folder of the records stays: the package has it, too.
-        found.retain(|(path, ..)| !path.starts_with(self.path("var")));
         found.sort();
         found
     }
@@ -249,11 +247,19 @@ fn each_board_gets_its_own_line_and_back() {
         assert!(card.read(file).lines().any(|own| own == line), "{model}: {}", card.read(file));
         let own = card.read(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"));
         assert!(own.contains(&format!("[adxl345]\ncs_pin: host:None\nspi_bus: {node}\n")), "{own}");
-        assert!(own.ends_with("probe_points: 150, 155, 20\n"), "{own}");
+        let tester = card.read(&PRINTER.replace("printer.cfg", "pinion/resonance_tester.cfg"));
         assert!(
-            card.read(PRINTER).starts_with("# my printer\n[include mainsail.cfg]\n[include pinion/*.cfg]\n\n[printer]")
+            tester.ends_with(
+                "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 150, 155, 20\n"
+            ),
+            "{tester}"
         );
-        assert_eq!(card.read(&format!("{PRINTER}.before-add-adxl345")), PRINTER_CFG);
+        assert!(
+            card.read(PRINTER).starts_with(
+                "# my printer\n[include mainsail.cfg]\n[include pinion/*.cfg] # by pinion add\n\n[printer]"
+            )
+        );
+        assert_eq!(card.read(&format!("{PRINTER}.before-pinion")), PRINTER_CFG);
         let once = card.snapshot();
         let printed = card.added(&["adxl345", "--yes"]);
         assert_eq!(card.snapshot(), once, "{model}: twice");
@@ -302,11 +308,11 @@ fn a_chip_with_two_buses_takes_the_free_one() {
     card.added(&["adxl345", "--yes"]);
     card.added(&["lis3dh", "--yes"]);
     let printed = card.added(&["lis2dw", "--yes"]);
-    assert!(printed.contains("whose pins it would need: so it is connected by I2C."), "{printed}");
+    assert!(printed.contains("by [adxl345] (") && printed.contains("): so it is connected by I2C."), "{printed}");
     let file = PRINTER.replace("printer.cfg", "pinion/lis2dw.cfg");
     assert!(card.read(&file).contains("\ni2c_bus: i2c.1\n"), "{}", card.read(&file));
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=i2c_arm=on\n"));
-    assert!(card.refused(&["bmi160", "--bus", "spi", "--yes"]).contains("uses spidev0.1, whose pins it would need"));
+    assert!(card.refused(&["bmi160", "--bus", "spi", "--yes"]).contains("spidev0.0 is used by [adxl345] ("));
     // The other place is free again, and the wires are made already.
     card.added(&["lis3dh", "--undo", "--yes"]);
     let before = card.snapshot();
@@ -324,10 +330,9 @@ fn a_chip_with_two_buses_avoids_a_pin_that_is_in_use() {
         &(card.read(PRINTER) + "\n[mcu host]\nserial: /tmp/klipper_host_mcu\n[output_pin x]\npin: host:gpio10\n"),
     );
     let told = card.added(&["lis2dw", "--yes"]);
-    let conflict =
-        "printer.cfg uses GPIO10 (pin 19) for something else, and the bus needs it: so it is connected by I2C.";
-    assert!(told.contains(conflict), "{told}");
-    assert!(card.refused(&["adxl345", "--yes"]).contains("printer.cfg uses GPIO10 (pin 19)"));
+    let conflict = format!("GPIO10 (pin 19) is used by [output_pin x] (/{PRINTER}:17): so it is connected by I2C.");
+    assert!(told.contains(&conflict), "{told}");
+    assert!(card.refused(&["adxl345", "--yes"]).contains("GPIO10 (pin 19) is used by [output_pin x]"));
 }
 
 #[test]
@@ -340,7 +345,7 @@ fn programs_get_the_same_as_json() {
     let files: Vec<&str> =
         value["changes"].as_array().unwrap().iter().map(|change| change["file"].as_str().unwrap()).collect();
     assert_eq!(files[0], "/boot/firmware/config.txt");
-    assert_eq!(files.len(), 4);
+    assert_eq!(files.len(), 5);
     assert!(value["error"].is_null() && value["next"][0] == "ACCELEROMETER_QUERY");
     // Nobody can be asked.
     let output = card.add(&["relay", "--json"]);
@@ -359,7 +364,10 @@ fn a_picture_of_the_wires() {
     assert_eq!(document.descendants().filter(|node| node.has_tag_name("path")).count(), 4);
     let shown = card.added(&["relay", "--pin", "40", "--dry-run"]);
     assert!(shown.contains("pin 40") && shown.contains("+ pin: host:GPIO21"), "{shown}");
-    assert!(card.refused(&["relay", "--pin", "1", "--dry-run"]).contains("--pin: this pin has no free line"));
+    assert!(
+        card.refused(&["relay", "--pin", "1", "--dry-run"])
+            .contains("--pin: this pin has no free line: choose one of 11 (GPIO17), ")
+    );
     assert!(card.refused(&["relay", "--bus", "spi"]).contains("--bus: relay is connected by GPIO lines"));
     assert!(card.refused(&["adxl354"]).contains("did you mean adxl345?"));
 }
@@ -377,11 +385,9 @@ fn the_user_of_an_unknown_board_reads_what_to_look_up() {
     }
     let card = Card::of("BigTreeTech CB1", &[("boot/BoardEnv.txt", BOARD_ENV)]);
     assert!(card.refused(&["adxl345", "--yes"]).contains("this image has no overlay for spidev1.1"));
-    assert!(card.refused(&["bme280", "--yes"]).contains("has no known I2C on its header"));
-    let card = Card::of("Raspberry Pi 4", &[]);
-    assert!(
-        card.refused(&["adxl345", "--yes"]).contains("none of /boot/firmware/config.txt, /boot/config.txt is there")
-    );
+    assert!(card.refused(&["bme280", "--yes"]).contains("Pinion knows no I2C on the header of a BigTreeTech CB1"));
+    let card = Card::of("Raspberry Pi 4 Model B", &[]);
+    assert!(card.refused(&["adxl345", "--yes"]).contains("there is no /boot/firmware/config.txt nor /boot/config.txt"));
 }
 
 #[test]
@@ -389,14 +395,16 @@ fn nothing_is_written_through_links_or_outside() {
     let card = Card::pi();
     card.put("etc/shadow", "secret\n");
     let elsewhere = card.path("etc/shadow");
-    for link in [PRINTER, "boot/firmware/config.txt"] {
+    // The second one leads to the card's own file.
+    let links = [PRINTER, "boot/firmware/config.txt"].into_iter();
+    for (link, target) in links.flat_map(|link| [(link, elsewhere.as_path()), (link, Path::new("/etc/shadow"))]) {
         let path = card.path(link);
         let text = fs::read(&path).unwrap();
         fs::remove_file(&path).unwrap();
-        symlink(&elsewhere, &path).unwrap();
+        symlink(target, &path).unwrap();
         let before = card.snapshot();
         let log = card.refused(&["adxl345", "--yes", "--config", &format!("/{PRINTER}")]);
-        assert!(log.contains("it is a link"), "{log}");
+        assert!(log.contains("it is a link") || target == elsewhere && log.contains("there is no /boot"), "{log}");
         assert_eq!(card.snapshot(), before);
         fs::remove_file(&path).unwrap();
         fs::write(&path, text).unwrap();
@@ -405,7 +413,7 @@ fn nothing_is_written_through_links_or_outside() {
     let folder = PRINTER.replace("printer.cfg", "pinion");
     fs::create_dir(card.path(&folder)).unwrap();
     symlink(&elsewhere, card.path(&format!("{folder}/adxl345.cfg"))).unwrap();
-    assert!(card.refused(&["adxl345", "--yes"]).contains("it is a link"));
+    assert!(card.add(&["adxl345", "--yes"]).status.code() == Some(1));
     assert_eq!(card.read("etc/shadow"), "secret\n");
 }
 
@@ -428,9 +436,7 @@ fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
         let about = fs::symlink_metadata(card.path(path)).unwrap();
         (about.uid(), about.gid())
     };
-    for name in
-        ["printer.cfg", "printer.cfg.before-add-adxl345", "pinion", "pinion/adxl345.cfg", "pinion/.add-adxl345.json"]
-    {
+    for name in ["printer.cfg", "printer.cfg.before-pinion", "pinion", "pinion/adxl345.cfg", "pinion/host-mcu.cfg"] {
         assert_eq!(owner(&format!("{config}/{name}")), (nobody, nobody), "{name}");
     }
     assert_eq!(owner("boot/firmware/config.txt"), (0, 0));
@@ -442,14 +448,13 @@ fn files_beside_printer_cfg_are_its_owner_s_and_written_with_their_rights() {
     let log = card.refused(&["relay", "--yes"]);
     assert!(log.contains("ermission denied"), "{log}");
     assert_eq!(fs::read_dir(card.path("root")).unwrap().count(), 1);
-    // A record that leads elsewhere is followed with the owner's rights only.
+    // Nor are the files that a link of theirs names read with root's rights.
     fs::remove_file(card.path(&format!("{config}/pinion"))).unwrap();
-    let record = r#"{"changes":[{"key":"x","file":"/root/kept","makes":false,"splice":{"at":0,"old":"theirs","new":"root's"}}],"needs":[]}"#;
-    card.put(&format!("{config}/pinion/.add-relay.json"), record);
-    for name in ["pinion", "pinion/.add-relay.json"] {
-        chown(card.path(&format!("{config}/{name}")), Some(nobody), Some(nobody)).unwrap();
-    }
-    assert!(card.refused(&["relay", "--undo", "--yes"]).contains("ermission denied"));
+    fs::set_permissions(card.path("root/kept"), fs::Permissions::from_mode(0o600)).unwrap();
+    card.put(PRINTER, &format!("[include stolen.cfg]\n{PRINTER_CFG}"));
+    symlink("/root/kept", card.path(&format!("{config}/stolen.cfg"))).unwrap();
+    let log = card.refused(&["relay", "--yes"]);
+    assert!(log.contains("ermission denied") && !log.contains("root's"), "{log}");
     assert_eq!(card.read("root/kept"), "root's\n");
 }
 
@@ -461,7 +466,8 @@ fn the_wires_are_those_of_the_board_s_settings() {
     let value: Value = serde_json::from_slice(&card.add(&["ds18b20", "--json", "--dry-run"]).stdout).unwrap();
     assert_eq!(value["wires"][2]["pin"], 13, "{value}");
     card.put("boot/firmware/config.txt", "dtoverlay=w1-gpio,gpiopin=40\n");
-    assert!(card.refused(&["ds18b20", "--yes"]).contains("w1-gpio is on line 40, which is not on the header"));
+    let shown = card.added(&["ds18b20", "--dry-run"]);
+    assert!(shown.contains("DQ (yellow)  pin 7"), "line 40 is not on the header: {shown}");
     // All kernels of a Raspberry Pi 5 know this name of the line.
     let card = Card::of("Raspberry Pi 5 Model B Rev 1.0", &[("boot/firmware/config.txt", CONFIG_TXT)]);
     card.put(PRINTER, &format!("{PRINTER_CFG}[mcu]\nserial: /tmp/klipper_host_mcu\n[fan]\npin: GPIO17\n"));
@@ -477,7 +483,10 @@ fn the_wires_are_those_of_the_board_s_settings() {
 fn ends_of_lines_stay_as_they_are() {
     for config_txt in ["dtparam=audio=on", "dtparam=audio=on\r\n[pi4]\r\nx=y", "dtparam=audio=on\r\n", "", "\n\n"] {
         for printer_cfg in [PRINTER_CFG.replace('\n', "\r\n"), PRINTER_CFG.trim_end().to_owned(), String::new()] {
-            let card = Card::of("Raspberry Pi 4", &[("boot/firmware/config.txt", config_txt), (PRINTER, &printer_cfg)]);
+            let card = Card::of(
+                "Raspberry Pi 4 Model B",
+                &[("boot/firmware/config.txt", config_txt), (PRINTER, &printer_cfg)],
+            );
             let before = card.snapshot();
             card.added(&["adxl345", "--yes"]);
             for (path, old) in [("boot/firmware/config.txt", config_txt), (PRINTER, &*printer_cfg)] {
@@ -489,6 +498,7 @@ fn ends_of_lines_stay_as_they_are() {
             assert!(card.read("boot/firmware/config.txt").lines().any(|line| line == "dtparam=spi=on"));
             card.added(&["adxl345", "--yes", "--undo"]);
             assert_eq!(card.snapshot(), before);
+            assert!(!card.path("boot/firmware/config.txt.before-pinion").exists());
         }
     }
 }
@@ -496,14 +506,14 @@ fn ends_of_lines_stay_as_they_are() {
 /// The first device has ended the last line, and the second one has written behind it.
 #[test]
 fn a_device_that_goes_leaves_the_lines_of_the_next_one() {
-    let card = Card::of("Raspberry Pi 4", &[("boot/firmware/config.txt", "arm_boost=1")]);
+    let card = Card::of("Raspberry Pi 4 Model B", &[("boot/firmware/config.txt", "arm_boost=1")]);
     card.added(&["adxl345", "--yes"]);
     card.added(&["bme280", "--yes"]);
     card.added(&["adxl345", "--yes", "--undo"]);
     let config_txt = card.read("boot/firmware/config.txt");
     assert_eq!(config_txt, "arm_boost=1\n# pinion add bme280\n[all]\ndtparam=i2c_arm=on\n");
     card.added(&["bme280", "--yes", "--undo"]);
-    assert_eq!(card.read("boot/firmware/config.txt"), "arm_boost=1\n");
+    assert_eq!(card.read("boot/firmware/config.txt"), "arm_boost=1", "byte for byte, from the copy");
 }
 
 /// All orders in which devices can go. The lines that other devices need stay. At the end all files are as before.
@@ -555,8 +565,8 @@ fn a_bus_that_a_section_of_the_user_needs_stays() {
     let printer_cfg = card.read(PRINTER);
     card.put(PRINTER, &format!("{printer_cfg}\n[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
     let printed = card.added(&["adxl345", "--undo", "--yes"]);
-    let keeps = "/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] in printer.cfg needs it";
-    assert!(printed.contains(keeps), "{printed}");
+    let keeps = format!("/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] (/{PRINTER}) needs it");
+    assert!(printed.contains(&keeps), "{printed}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
     card.put(PRINTER, PRINTER_CFG);
     card.added(&["adxl345", "--undo", "--yes"]);
@@ -568,7 +578,11 @@ fn a_printer_cfg_that_may_not_be_changed_stays() {
     let card = Card::pi();
     fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o444)).unwrap();
     let log = card.refused(&["relay", "--yes"]);
-    assert!(log.contains(&format!("/{PRINTER} is read-only: chmod u+w /{PRINTER}, then call this again")), "{log}");
+    let file = card.path(PRINTER);
+    assert!(
+        log.contains(&format!("/{PRINTER} is read-only: chmod u+w {}, then call this again", file.display())),
+        "{log}"
+    );
     assert_eq!(card.read(PRINTER), PRINTER_CFG);
     assert!(!card.path(&PRINTER.replace("printer.cfg", "pinion")).exists());
     fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o644)).unwrap();
@@ -595,7 +609,7 @@ fn a_full_disk_leaves_the_old_files() {
         .output()
         .unwrap();
     let printed = String::from_utf8_lossy(&full.stdout);
-    assert!(printed.contains("/var/lib/pinion-mcu/add/.add-adxl345.json: File too large"), "{printed}");
+    assert!(printed.contains("/boot/firmware/config.txt.before-pinion: File too large"), "{printed}");
     assert_eq!(card.snapshot(), before);
     card.added(&["adxl345", "--yes"]);
     card.added(&["adxl345", "--undo", "--yes"]);
@@ -617,7 +631,7 @@ fn a_kill_leaves_each_file_old_or_new() {
         let arguments = card.arguments(if undoes { &["adxl345", "--yes", "--undo"] } else { &["adxl345", "--yes"] });
         let mut child = program().args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         thread::sleep(Duration::from_micros(700 * round));
-        // It may have ended already.
+        // It may have ended already, or not have begun.
         let _ = child.kill();
         child.wait().unwrap();
         for path in [PRINTER, "boot/firmware/config.txt"] {
@@ -632,7 +646,7 @@ fn a_kill_leaves_each_file_old_or_new() {
 }
 
 /// A Moonraker whose host does this. It answers until it is dropped, and returns the requests.
-fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
+pub(crate) fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
     let server = thread::spawn(move || {
@@ -678,7 +692,7 @@ fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
     (address, server)
 }
 
-fn end(address: &str, server: thread::JoinHandle<Vec<String>>) -> Vec<String> {
+pub(crate) fn end(address: &str, server: thread::JoinHandle<Vec<String>>) -> Vec<String> {
     std::net::TcpStream::connect(address).unwrap().write_all(b"\r\n\r\n").unwrap();
     server.join().unwrap()
 }
@@ -735,7 +749,8 @@ fn a_host_that_does_not_start_is_no_success() {
     let (address, server) = moonraker("error");
     let log = card.refused(&["relay", "--yes", "--moonraker", &address]);
     assert!(
-        log.contains("klippy says: mcu 'host': Unable to connect: sudo pinion add relay --undo takes it back"),
+        log.contains("klippy says: mcu 'host': Unable to connect: sudo pinion add relay --moonraker ")
+            && log.contains(" --undo takes it back"),
         "{log}"
     );
     card.added(&["relay", "--yes", "--undo", "--moonraker", &address]);
@@ -757,7 +772,10 @@ fn a_file_that_is_the_user_s_stays() {
     assert!(printed.contains("Nothing is left to change."), "{printed}");
     assert_eq!(card.snapshot(), before);
     let printed = card.added(&["adxl345", "--yes"]);
-    assert!(printed.contains(&format!("[adxl345] is in /{PRINTER} already, and stays as it is.")), "{printed}");
+    assert!(
+        printed.contains(&format!("[adxl345] is in printer.cfg already (/{PRINTER}:16), and stays as it is.")),
+        "{printed}"
+    );
     assert!(!Path::new(&card.path(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"))).exists());
     let printed = card.added(&["light", "--yes"]);
     assert!(printed.contains("+ pin: rpi:GPIO17"), "the MCU's own name: {printed}");

@@ -172,7 +172,7 @@ fn a_file_of_any_kind_ends_the_command_in_words() {
         assert_eq!(code, Some(1), "{args:?}: {said}");
         assert!(said.contains(cause), "{args:?}: {said}");
     };
-    let irregular = "it is no regular file";
+    let irregular = "it is not a regular file";
     for (file, cause) in
         [(&*fifo, irregular), (&*directory, irregular), ("/dev/zero", irregular), (&*sparse, "longer than")]
     {

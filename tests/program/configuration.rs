@@ -67,7 +67,7 @@ fn a_check_says_what_can_be_served_and_serves_nothing() {
     let (code, out, log) = checked("board = \"sim\"\ndialect = \"kalico\"\n", &["-g", "0"]);
     let root = nix::unistd::geteuid().is_root();
     assert_eq!(code, Some(i32::from(!root)), "only root may give the group away:\n{out}{log}");
-    for line in ["  ok       board sim", "  ok       dialect kalico", "tty can be made"] {
+    for line in ["  ok       board sim", "  ok       dialect kalico", "tty: klippy takes it for a serial port"] {
         assert!(out.contains(line), "no \"{line}\" in:\n{out}");
     }
     assert_eq!(out.contains("\n0 errors"), root, "{out}");

@@ -140,7 +140,7 @@ fn a_file_that_is_no_recording_is_refused() {
     let said = complaint(&trace(folder.path(), &["/nonexistent/x"]));
     assert!(said.contains("/nonexistent/x: No such file"), "{said}");
     let said = complaint(&trace(folder.path(), &["/dev/null"]));
-    assert!(said.contains("/dev/null: it is no regular file"), "{said}");
+    assert!(said.contains("/dev/null: it is not a regular file"), "{said}");
 }
 
 #[test]

@@ -28,7 +28,7 @@ pub fn open(path: &Path) -> io::Result<(File, Metadata)> {
     let place = OpenOptions::new().read(true).custom_flags(OFlag::O_PATH.bits()).open(path)?;
     let about = place.metadata()?;
     if !about.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"));
     }
     let flags = (OFlag::O_NONBLOCK | OFlag::O_NOCTTY).bits();
     let same = format!("/proc/self/fd/{}", place.as_raw_fd());

@@ -49,43 +49,8 @@ impl OwnFolder {
         OwnFolder::reach(path, true)
     }
 
-    /// openat2(2) would not do: it can refuse all links or none, and systemd's `RestrictSUIDSGID=` refuses the call.
     fn reach(path: &Path, makes: bool) -> io::Result<OwnFolder> {
-        let start = |is_absolute| open(if is_absolute { "/" } else { "." }, STEP, Mode::empty());
-        let mut folder = start(path.is_absolute())?;
-        let mut links = 0;
-        // The last one is the next.
-        let mut way: Vec<OsString> = steps(path).collect();
-        while let Some(name) = way.pop() {
-            let step = || openat(&folder, name.as_os_str(), STEP, Mode::empty());
-            let next = match step() {
-                Err(Errno::ENOENT) if makes => {
-                    judge(&fstat(&folder)?)?;
-                    match mkdirat(&folder, name.as_os_str(), FOLDER_MODE) {
-                        Ok(()) | Err(Errno::EEXIST) => step()?,
-                        Err(error) => return Err(error.into()),
-                    }
-                }
-                stepped => stepped?,
-            };
-            let about = fstat(&next)?;
-            if kind(&about) != SFlag::S_IFLNK {
-                folder = next;
-                continue;
-            }
-            if !is_trusted(&about) {
-                return Err(of_another("a link on the way to it", &about));
-            }
-            links += 1;
-            if links > LINKS_MAX {
-                return Err(Errno::ELOOP.into());
-            }
-            let target = PathBuf::from(readlinkat(&next, "")?);
-            if target.is_absolute() {
-                folder = start(true)?;
-            }
-            way.extend(steps(&target));
-        }
+        let folder = walk(path, makes)?.there.ok_or(Errno::ENOENT)?;
         judge(&fstat(&folder)?)?;
         Ok(OwnFolder(folder))
     }
@@ -111,6 +76,73 @@ impl OwnFolder {
             created => created,
         }
     }
+}
+
+/// The end of a path, reached without a link of another user.
+pub struct PathEnd {
+    /// The folder of the last name.
+    pub folder: OwnedFd,
+    /// The last name: not a link.
+    pub name: OsString,
+    /// What has this name, opened with `O_PATH`. `None` if there is nothing.
+    pub there: Option<OwnedFd>,
+}
+
+/// Follows a path to its end, and the links of root and our own on the way. A link at the end is followed, too.
+///
+/// # Errors
+///
+/// A folder on the way is missing. A link on the way belongs to another user, who could lead us to any file.
+pub fn end_of_path(path: &Path) -> io::Result<PathEnd> {
+    walk(path, false)
+}
+
+/// Follows a path. With `makes`, folders that are missing are made, in folders of our own only.
+///
+/// openat2(2) would not do: it can refuse all links or none, and systemd's `RestrictSUIDSGID=` refuses the call.
+fn walk(path: &Path, makes: bool) -> io::Result<PathEnd> {
+    let start = |is_absolute| open(if is_absolute { "/" } else { "." }, STEP, Mode::empty());
+    let mut folder = start(path.is_absolute())?;
+    let mut links = 0;
+    // The last one is the next.
+    let mut way: Vec<OsString> = steps(path).collect();
+    while let Some(name) = way.pop() {
+        let step = || openat(&folder, name.as_os_str(), STEP, Mode::empty());
+        let next = match step() {
+            Err(Errno::ENOENT) if makes => {
+                judge(&fstat(&folder)?)?;
+                match mkdirat(&folder, name.as_os_str(), FOLDER_MODE) {
+                    Ok(()) | Err(Errno::EEXIST) => step()?,
+                    Err(error) => return Err(error.into()),
+                }
+            }
+            Err(Errno::ENOENT) if way.is_empty() => return Ok(PathEnd { folder, name, there: None }),
+            stepped => stepped?,
+        };
+        let about = fstat(&next)?;
+        if kind(&about) != SFlag::S_IFLNK {
+            if way.is_empty() {
+                return Ok(PathEnd { folder, name, there: Some(next) });
+            }
+            folder = next;
+            continue;
+        }
+        if !is_trusted(&about) {
+            return Err(of_another("a link on the way to it", &about));
+        }
+        links += 1;
+        if links > LINKS_MAX {
+            return Err(Errno::ELOOP.into());
+        }
+        let target = PathBuf::from(readlinkat(&next, "")?);
+        if target.is_absolute() {
+            folder = start(true)?;
+        }
+        way.extend(steps(&target));
+    }
+    // The path has no name, as `/`, or a link leads to one that has none.
+    let there = openat(&folder, ".", STEP, Mode::empty())?;
+    Ok(PathEnd { folder, name: ".".into(), there: Some(there) })
 }
 
 /// The path of an open file, whatever has its name by now.

@@ -96,16 +96,21 @@ struct Owner {
 
 impl Owner {
     fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
-        let attempt = args.own.attempt(args.realtime)?;
+        let attempt = args.own.attempt()?;
         let place = Place::make(&own, &args.own, args.symlink.as_deref())?;
         Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
     }
 }
 
+/// A trial runs the programs in a printer.cfg, so root's rights are left before it.
+fn leave_root(args: &SimArgs, printer_cfg: &Path) -> Result<(), Trouble> {
+    if args.own.attempt { attempt::rights::leave_root(printer_cfg, args.realtime) } else { Ok(()) }
+}
+
 /// Shows the printer at work and continues to serve it, or prints its configuration.
 pub(crate) fn run(args: &SimArgs) -> ExitCode {
     let own = match args.file.as_deref().filter(|file| is_printer_cfg(file)) {
-        Some(file) => match own::run::read(file, &args.own) {
+        Some(file) => match leave_root(args, file).and_then(|()| own::run::read(file, &args.own)) {
             Ok(own) => Some(own),
             Err(mistake) if args.own.attempt => return attempt::refused(file, mistake, args.own.form()),
             Err(mistake) => return failed(mistake),
@@ -319,13 +324,11 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
         log::error!("{error}");
         Arc::default()
     });
-    // Without a permission klippy runs as this program does, which has a warning in the log.
-    let realtime = args.realtime && realtime::is_permitted().is_ok();
     let (owner, probe, right) = (owner.clone(), probe.clone(), right.clone());
-    let attempt = Attempt { realtime, ..attempt.clone() };
+    let (attempt, realtime) = (attempt.clone(), args.realtime);
     let thread = thread::Builder::new().name("try".into()).spawn(move || {
         if realtime {
-            // The link's thread starts it, and passes its real-time priority on.
+            // The link's thread starts it, and passes its real-time priority on. klippy does not get it.
             realtime::leave();
         }
         if let Place::Folder(folder) = &owner.place {

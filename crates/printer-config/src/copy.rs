@@ -5,7 +5,9 @@
 //! one's folder get a place in [`OUTSIDE`], and the line that includes them names it.
 
 use std::collections::{HashMap, HashSet};
-use std::fs;
+use std::fs::{self, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -48,13 +50,31 @@ pub fn write(config: &Config, changes: &[Change], folder: &Path) -> Result<PathB
     for file in &config.files {
         let text = changed(config, changes, &file.path, &places, &mut opened, &file.text);
         let path = folder.join(&places[&file.path]);
-        let written = path.parent().map_or(Ok(()), fs::create_dir_all).and_then(|()| fs::write(&path, text));
+        let written = path
+            .parent()
+            .map_or(Ok(()), fs::create_dir_all)
+            .and_then(|()| write_like(&file.path, &path, text.as_bytes()));
         written.map_err(|error| {
             let trouble = Trouble::new(format!("the copy cannot be written: {error}"));
             trouble.of(path.display()).remedy("free space, or name another folder")
         })?;
     }
     Ok(folder.join(&places[&main]))
+}
+
+/// Writes a copy anew, with the permissions of its source, which may have secrets.
+///
+/// # Errors
+///
+/// Those of the kernel.
+pub fn write_like(source: &Path, copy: &Path, bytes: &[u8]) -> io::Result<()> {
+    // Without a source, as in tests, it is readable for everybody.
+    let mode = fs::metadata(source).map_or(0o644, |about| about.permissions().mode() & 0o777);
+    match fs::remove_file(copy) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    OpenOptions::new().write(true).create_new(true).mode(mode).open(copy)?.write_all(bytes)
 }
 
 /// The text of a file in the copy. `opened` has the sections with options that came already.

@@ -56,6 +56,22 @@ impl Config {
         Ok(config)
     }
 
+    /// The text of the main file without the lines of these sections in its SAVE_CONFIG block.
+    pub fn without_saved(&self, text: &str, sections: &[&str]) -> String {
+        let Some(main) = self.files.first() else { return text.to_owned() };
+        let Some(at) = main.text.find(SAVED) else { return text.to_owned() };
+        let first = main.text[..at].matches('\n').count() + SAVED.matches('\n').count();
+        let mut is_gone = false;
+        let kept = text.split_inclusive('\n').enumerate().filter(|(number, line)| {
+            let line = line.strip_prefix("#*# ").unwrap_or("");
+            if *number >= first && line.starts_with('[') {
+                is_gone = crate::parse::header(line.trim_end()).is_some_and(|name| sections.contains(&name));
+            }
+            *number < first || !is_gone
+        });
+        kept.map(|(_, line)| line).collect()
+    }
+
     /// Adds the options of the SAVE_CONFIG block that the files do not set. klippy comments the others out.
     fn add_saved(&mut self, file: &Arc<Path>, before: usize, lines: &[&str]) -> Result<(), Trouble> {
         let mut section = String::new();

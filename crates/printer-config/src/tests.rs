@@ -162,7 +162,7 @@ fn hostile_configurations_end_at_once_with_a_line() {
     let path = folder.path().join("p.cfg");
     let read = || Config::read(&path).map(|_| ()).unwrap_err().to_string();
     nix::unistd::mkfifo(&path, nix::sys::stat::Mode::S_IRWXU).unwrap();
-    assert!(read().contains("it is no regular file"), "{}", read());
+    assert!(read().contains("it is not a regular file"), "{}", read());
     fs::remove_file(&path).unwrap();
     fs::File::create(&path).unwrap().set_len(1 << 30).unwrap();
     assert!(read().contains("it is longer than 4 MiB"), "{}", read());

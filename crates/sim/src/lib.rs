@@ -24,7 +24,7 @@ pub use board::{SimBoard, SimWorld};
 pub use catalog::PartConfig;
 pub use config::SimConfig;
 pub use description::axes::{AxisConfig, BedConfig, CarriageConfig, DeltaConfig, End, Limits};
-pub use description::boards::{ConstantValue, McuConfig};
+pub use description::boards::{ConstantValue, MCUS_MAX, McuConfig};
 pub use description::buses::{I2cBusConfig, SpiBusConfig};
 pub use description::heater::{FanConfig, HeaterConfig};
 pub use description::kinematics::{DeltesianConfig, KinematicsConfig, NoKeys, RotaryDeltaConfig, WinchConfig};

@@ -1,106 +1,135 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The boot loader's settings: which line of config.txt, or which overlay, enables a bus.
+//! The lines that enable a bus in the boot loader's settings, and the way back.
+//!
+//! Each of our lines has a comment with the device that needs it. So the file itself says which lines are ours:
+//!
+//! ```text
+//! # pinion add adxl345
+//! [all]
+//! dtparam=spi=on
+//! ```
+//!
+//! In a file with `overlays=` the comment also names the change: `# pinion add adxl345: overlays+=spidev1_1`.
 
 use std::collections::BTreeSet;
 
-use super::board::Bus;
-use super::splice::Splice;
+use super::side::MARK;
+use crate::cli::computer::board::Bus;
+use crate::cli::computer::uses::boot::{Line, Loaded, is_on, parameter};
 
-/// The values with which config.txt switches a parameter on. None is also one.
-const ON: [&str; 4] = ["on", "true", "yes", "1"];
-
-/// The insertions into a config.txt so that all of `wanted` are on for a board to which these sections apply, each with
-/// its line. Each has a section of its own, so that another device can keep it. `device` names the lines for a reader.
-pub(super) fn config_txt(text: &str, sections: &[String], device: &str, wanted: &[&str]) -> Vec<(String, Splice)> {
-    let end = if text.contains("\r\n") { "\r\n" } else { "\n" };
-    let mut at = text.len();
-    let mut before = if text.is_empty() || text.ends_with('\n') { "" } else { end };
-    let mut splices = Vec::new();
-    for line in wanted.iter().filter(|line| !is_on(text, sections, line)) {
-        let new = format!("{before}# pinion add {device}{end}[all]{end}{line}{end}");
-        before = "";
-        splices.push(((*line).to_owned(), Splice::insert(at, new)));
-        at += splices.last().map_or(0, |(_, splice)| splice.new.len());
-    }
-    splices
+fn end_of(text: &str) -> &'static str {
+    if text.contains("\r\n") { "\r\n" } else { "\n" }
 }
 
-/// The line that a config.txt gives to 1-Wire, if it is not the overlay's own.
-pub(super) fn w1_line(text: &str, sections: &[String]) -> Option<u32> {
-    let lines = applying(text, sections);
-    let overlay = lines.iter().rev().find_map(|line| line.strip_prefix("dtoverlay=w1-gpio,"))?;
-    overlay.split(',').find_map(|parameter| parameter.trim().strip_prefix("gpiopin="))?.parse().ok()
+/// A text whose last line has an end.
+fn ended(text: &str) -> String {
+    if text.is_empty() || text.ends_with('\n') { text.to_owned() } else { format!("{text}{}", end_of(text)) }
 }
 
-/// The lines of a config.txt that apply. Sections whose condition is not known do not count.
-fn applying<'a>(text: &'a str, sections: &[String]) -> Vec<&'a str> {
-    let mut applies = true;
-    let mut lines = Vec::new();
-    for line in text.lines().map(str::trim) {
-        match line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
-            Some(section) => applies = section == "all" || sections.iter().any(|own| own == section),
-            None if applies && !line.starts_with('#') => lines.push(line),
-            None => {}
-        }
-    }
-    lines
+/// A config.txt in which all of `wanted` are on. `lines` and `loaded` are what it says now. `device` is the user of the
+/// lines.
+pub(super) fn config_txt(text: &str, lines: &[Line], loaded: &[Loaded], device: &str, wanted: &[String]) -> String {
+    let end = end_of(text);
+    let missing = wanted.iter().filter(|line| !has(lines, loaded, line));
+    missing.fold(text.to_owned(), |text, line| ended(&text) + &format!("# {MARK} {device}{end}[all]{end}{line}{end}"))
 }
 
 /// Whether a config.txt has the effect of this line.
-fn is_on(text: &str, sections: &[String], wanted: &str) -> bool {
-    let lines = applying(text, sections);
+fn has(lines: &[Line], loaded: &[Loaded], wanted: &str) -> bool {
     if let Some(wanted) = wanted.strip_prefix("dtparam=") {
         let (key, value) = wanted.split_once('=').unwrap_or((wanted, "on"));
-        let settings = lines.iter().filter_map(|line| line.strip_prefix("dtparam=")).flat_map(|line| line.split(','));
-        let mut settings = settings.map(|setting| setting.split_once('=').unwrap_or((setting, "on")));
-        let last = settings.rfind(|(own, _)| parameter(own.trim()) == key);
-        return last.is_some_and(|(_, own)| own.trim() == value || ON.contains(&own.trim()) && ON.contains(&value));
+        let base = loaded.iter().filter(|loaded| loaded.name.is_empty() && loaded.is_sure);
+        let last = base.flat_map(|loaded| &loaded.parameters).rfind(|(own, _)| parameter(own) == key);
+        return last.is_some_and(|(_, own)| own == value || is_on(own) && is_on(value));
     }
     if let Some(overlay) = wanted.strip_prefix("dtoverlay=") {
-        let own = lines.iter().filter_map(|line| line.strip_prefix("dtoverlay="));
-        let name = |overlay: &str| overlay.split(',').next().unwrap_or_default().trim().to_owned();
-        // The same overlay may load several devices, and then they differ by its parameters.
-        return own.clone().any(|own| own == overlay)
-            || !overlay.contains(',') && own.into_iter().any(|own| name(own) == overlay);
+        return loaded.iter().any(|loaded| loaded.is_sure && is_of(loaded, overlay));
     }
     let (key, value) = wanted.split_once('=').unwrap_or((wanted, ""));
-    let mut settings = lines.iter().filter_map(|line| line.split_once('='));
+    let sure = lines.iter().filter(|line| line.applies == Some(true));
+    let mut settings = sure.filter_map(|line| line.text.split_once('='));
     settings.rfind(|(own, _)| own.trim() == key).is_some_and(|(_, own)| own.trim() == value)
 }
 
-/// A parameter of config.txt by its usual name. The others are in overlays/README.
-fn parameter(name: &str) -> &str {
-    match name {
-        "i2c" | "i2c1" => "i2c_arm",
-        "i2c_baudrate" | "i2c1_baudrate" => "i2c_arm_baudrate",
-        name => name,
-    }
+/// Whether an overlay that is loaded is this one, such as `anyspi:spi0-0,dev="microchip,mcp3208"`, with all its parameters.
+/// Its user may have added others.
+pub(super) fn is_of(loaded: &Loaded, wanted: &str) -> bool {
+    let (name, parameters) = wanted.split_at(wanted.find([',', ':']).unwrap_or(wanted.len()));
+    let set = |part: &str| {
+        let (key, value) = part.split_once('=').unwrap_or((part, "on"));
+        loaded.parameters.iter().any(|(own, is)| own == key && is == value)
+    };
+    let mut parts = parameters.get(1..).unwrap_or_default().split(',').filter(|part| !part.is_empty());
+    loaded.name == name && parts.all(set)
 }
 
-/// The changes to an armbianEnv.txt or its like so that an overlay of this bus is loaded. `files` are the names of the
-/// image's overlays, without `.dtbo`. Nothing if one is loaded already.
+/// One of our lines in a config.txt.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Own {
+    /// The number of the comment above it, from 0.
+    at: usize,
+    pub(super) device: String,
+    pub(super) line: String,
+}
+
+/// Our lines in a config.txt. One that somebody has changed is theirs.
+pub(super) fn own_lines(text: &str) -> Vec<Own> {
+    let lines: Vec<&str> = text.lines().map(str::trim_end).collect();
+    let own = lines.windows(3).enumerate().filter_map(|(at, three)| {
+        let device = three[0].strip_prefix("# ")?.strip_prefix(MARK)?.trim();
+        let is_line = three[1] == "[all]" && !three[2].contains(['#', '[']) && three[2].contains('=');
+        is_line.then(|| Own { at, device: device.to_owned(), line: three[2].to_owned() })
+    });
+    own.collect()
+}
+
+/// Whether a config.txt still has lines of a device that somebody has changed.
+pub(super) fn has_changed_lines(text: &str, device: &str) -> bool {
+    let mark = format!("# {MARK} {device}");
+    let own = own_lines(text);
+    text.lines().filter(|line| line.trim_end() == mark).count() > own.iter().filter(|own| own.device == device).count()
+}
+
+/// The text without one of our lines.
+pub(super) fn without(text: &str, own: &Own) -> String {
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    let section = |lines: &[&str]| {
+        lines.iter().rev().map(|line| line.trim()).find(|line| line.starts_with('[')).map(str::to_owned)
+    };
+    // Lines behind ours may rely on our section.
+    let before = section(&lines[..own.at]).is_none_or(|section| section == "[all]");
+    let next =
+        lines[own.at + 3..].iter().map(|line| line.trim()).find(|line| !line.is_empty() && !line.starts_with('#'));
+    let keeps = !before && next.is_some_and(|next| !next.starts_with('['));
+    let is_gone = |at: usize| (own.at..own.at + 3).contains(&at) && !(keeps && at == own.at + 1);
+    lines.iter().enumerate().filter(|(at, _)| !is_gone(*at)).map(|(_, line)| *line).collect()
+}
+
+/// The text in which one of our lines is another device's.
+pub(super) fn handed_over(text: &str, own: &Own, device: &str) -> String {
+    let end = end_of(text);
+    let line =
+        |(at, line): (usize, &str)| if at == own.at { format!("# {MARK} {device}{end}") } else { line.to_owned() };
+    text.split_inclusive('\n').enumerate().map(line).collect()
+}
+
+/// An armbianEnv.txt or its like in which an overlay of this bus is loaded. `files` are the names of the image's overlays,
+/// without `.dtbo`.
 ///
 /// # Errors
 ///
-/// One line: the image has none of the known overlays, or another one uses the same pins.
-pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>) -> Result<Vec<Splice>, String> {
-    let loaded = last(text, "overlays").map(|(_, value)| value).unwrap_or_default();
-    let prefix = last(text, "overlay_prefix").map(|(_, value)| value).unwrap_or_default();
+/// One line: the image has none of the known overlays.
+pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>, device: &str) -> Result<String, String> {
+    let prefix = last(text, "overlay_prefix").unwrap_or_default().to_owned();
+    let loaded: Vec<&str> = last(text, "overlays").unwrap_or_default().split_whitespace().collect();
     let is = |token: &str, name: &str| token == name || token == format!("{prefix}-{name}");
-    let loaded: Vec<&str> = loaded.split_whitespace().collect();
-    if let Some(other) = bus.excludes.iter().find(|other| loaded.iter().any(|token| is(token, other))) {
-        return Err(format!("the overlay {other} uses {} already: remove it from overlays=", bus.node));
-    }
     let is_loaded = |way: &&Vec<String>| {
         let (name, parameters) = way.split_first().map_or(("", &[][..]), |(name, rest)| (name.as_str(), rest));
-        let set = |line: &String| {
-            let (key, value) = line.split_once('=').unwrap_or((line, ""));
-            last(text, key).is_some_and(|(_, own)| own == value)
-        };
+        let set = |line: &String| line.split_once('=').is_some_and(|(key, value)| last(text, key) == Some(value));
         loaded.iter().any(|token| is(token, name)) && parameters.iter().all(set)
     };
     if bus.overlays.iter().any(|way| is_loaded(&way)) {
-        return Ok(Vec::new());
+        return Ok(text.to_owned());
     }
     let has = |way: &&Vec<String>| {
         way.first().is_some_and(|name| files.contains(name) || files.contains(&format!("{prefix}-{name}")))
@@ -117,89 +146,130 @@ pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>) -> Resul
             ),
         });
     };
-    let mut splices = add_word(text, "overlays", name);
+    let end = end_of(text);
     let mut changed = text.to_owned();
-    splices.iter().for_each(|splice| splice.apply(&mut changed));
+    if !loaded.iter().any(|token| is(token, name)) {
+        let words = last(text, "overlays").filter(|words| !words.is_empty());
+        let words = words.map_or_else(|| name.clone(), |words| format!("{words} {name}"));
+        changed = set(&changed, "overlays", &words);
+        changed = ended(&changed) + &format!("# {MARK} {device}: overlays+={name}{end}");
+    }
     for line in parameters {
         let (key, value) = line.split_once('=').unwrap_or((line, ""));
-        let splice = set(&changed, key, value);
-        splice.apply(&mut changed);
-        splices.push(splice);
+        let old = last(&changed, key).map(str::to_owned);
+        if old.as_deref() == Some(value) {
+            continue;
+        }
+        changed = set(&changed, key, value);
+        let was = old.map_or("not set".to_owned(), |old| format!("was {old}"));
+        changed = ended(&changed) + &format!("# {MARK} {device}: {line}, {was}{end}");
     }
-    Ok(splices.into_iter().filter(|splice| splice.old != splice.new).collect())
+    Ok(changed)
 }
 
-/// The value of a key, from its last line, and where the value is. The boot loader imports the lines in order.
-fn last<'a>(text: &'a str, key: &str) -> Option<(usize, &'a str)> {
-    let mut at = 0;
-    let mut found = None;
-    for line in text.split_inclusive('\n') {
-        if let Some(value) = line.strip_prefix(key).and_then(|rest| rest.strip_prefix('=')) {
-            let value = value.trim_end();
-            found = Some((at + key.len() + 1, value));
+/// The changes of an `overlays=` file that are a device's, without the comments' beginnings.
+pub(super) fn own_settings(text: &str, device: &str) -> Vec<String> {
+    let head = format!("# {MARK} {device}: ");
+    text.lines().filter_map(|line| line.trim_end().strip_prefix(&head)).map(str::to_owned).collect()
+}
+
+/// The text without these changes of a device, and a line for each that is not as it was written.
+pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>) -> String {
+    let mut text = text.to_owned();
+    for own in own_settings(&text, device).into_iter().rev() {
+        let mark = format!("# {MARK} {device}: {own}");
+        text = text.split_inclusive('\n').filter(|line| line.trim_end() != mark).collect();
+        if let Some(word) = own.strip_prefix("overlays+=") {
+            let value = last(&text, "overlays").unwrap_or_default();
+            let words: Vec<&str> = value.split_whitespace().collect();
+            if !words.contains(&word) {
+                left.push(format!("overlays= has no {word} any more"));
+                continue;
+            }
+            // The user's own spaces stay.
+            let rest = value.strip_suffix(&format!(" {word}")).map(str::to_owned);
+            let others = || words.iter().copied().filter(|own| *own != word).collect::<Vec<_>>().join(" ");
+            let rest = rest.unwrap_or_else(others);
+            text = if rest.is_empty() { unset(&text, "overlays") } else { set(&text, "overlays", &rest) };
+            continue;
         }
-        at += line.len();
+        let Some(((key, value), was)) = own.rsplit_once(", ").and_then(|(set, was)| Some((set.split_once('=')?, was)))
+        else {
+            continue;
+        };
+        if last(&text, key) != Some(value) {
+            left.push(format!("{key} is not {value} any more, and stays"));
+            continue;
+        }
+        text = was.strip_prefix("was ").map_or_else(|| unset(&text, key), |old| set(&text, key, old));
     }
-    found
+    text
+}
+
+/// The text in which a device's changes are another device's.
+pub(super) fn settings_handed_over(text: &str, device: &str, to: &str) -> String {
+    text.replace(&format!("# {MARK} {device}: "), &format!("# {MARK} {to}: "))
+}
+
+/// The value of a key, from its last line. The boot loader imports the lines in order.
+fn last<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    let values = text.lines().filter_map(|line| line.strip_prefix(key)?.strip_prefix('='));
+    values.map(str::trim_end).next_back()
+}
+
+/// The text with a key's last line changed by `change`.
+fn changed(text: &str, key: &str, change: impl Fn(&str) -> String) -> Option<String> {
+    let is_it = |line: &&str| line.strip_prefix(key).is_some_and(|rest| rest.starts_with('='));
+    let at = text.split_inclusive('\n').collect::<Vec<_>>().iter().rposition(is_it)?;
+    let line = |(number, line): (usize, &str)| if number == at { change(line) } else { line.to_owned() };
+    Some(text.split_inclusive('\n').enumerate().map(line).collect())
 }
 
 /// Sets a key to a value.
-fn set(text: &str, key: &str, value: &str) -> Splice {
-    match last(text, key) {
-        Some((at, old)) => {
-            // With the key, the text is found again even if the file has changed above it.
-            let at = at - key.len() - 1;
-            Splice { at, old: format!("{key}={old}"), new: format!("{key}={value}"), word: None }
-        }
-        None => {
-            let end = if text.contains("\r\n") { "\r\n" } else { "\n" };
-            let before = if text.is_empty() || text.ends_with('\n') { "" } else { end };
-            Splice::insert(text.len(), format!("{before}{key}={value}{end}"))
-        }
-    }
+fn set(text: &str, key: &str, value: &str) -> String {
+    let with = |line: &str| format!("{key}={value}{}", &line[line.trim_end_matches(['\r', '\n']).len()..]);
+    changed(text, key, with).unwrap_or_else(|| ended(text) + &format!("{key}={value}{}", end_of(text)))
 }
 
-/// Adds a word to the value of a key. A line that is missing is a change of its own: it stays while another device has a
-/// word in it.
-fn add_word(text: &str, key: &str, word: &str) -> Vec<Splice> {
-    let mut splices = Vec::new();
-    let mut changed = text.to_owned();
-    if last(text, key).is_none() {
-        let line = set(text, key, "");
-        line.apply(&mut changed);
-        splices.push(line);
-    }
-    let words = last(&changed, key).map_or("", |(_, words)| words);
-    let value = if words.is_empty() { word.to_owned() } else { format!("{words} {word}") };
-    splices.push(Splice { word: Some(word.to_owned()), ..set(&changed, key, &value) });
-    splices
+fn unset(text: &str, key: &str) -> String {
+    changed(text, key, |_| String::new()).unwrap_or_else(|| text.to_owned())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::add::catalog::{Catalog, Kind};
+    use crate::cli::computer::board::{Board, Kind};
     use crate::cli::computer::tests::Tree;
+    use crate::cli::computer::uses::boot::{lines, loaded};
     use proptest::prelude::*;
 
-    const SPI: &[&str] = &["dtparam=spi=on"];
+    const FILE: &str = "/boot/firmware/config.txt";
 
-    fn with(text: &str, sections: &[&str], wanted: &[&str]) -> Option<String> {
-        let sections: Vec<String> = sections.iter().map(|section| (*section).to_owned()).collect();
-        let splices = config_txt(text, &sections, "x", wanted);
-        let mut changed = text.to_owned();
-        splices.iter().for_each(|(_, splice)| splice.apply(&mut changed));
-        assert_eq!(config_txt(&changed, &sections, "x", wanted), [], "{changed}");
-        for (_, splice) in splices.iter().rev() {
-            splice.revert(&mut changed).unwrap();
+    /// A config.txt of a Raspberry Pi 4 with these lines on, and the way back. `None` if nothing was missing.
+    fn with(text: &str, wanted: &[&str]) -> Option<String> {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
+        let wanted: Vec<String> = wanted.iter().map(|line| (*line).to_owned()).collect();
+        let on = |text: &str| {
+            tree.put(FILE.trim_start_matches('/'), text);
+            let computer = tree.computer();
+            let board = Board::of(&computer, None).unwrap().unwrap();
+            let lines = lines(&computer, &board, FILE);
+            config_txt(text, &lines, &loaded(&lines, &board), "x", &wanted)
+        };
+        let changed = on(text);
+        assert_eq!(on(&changed), changed, "a second time");
+        let mut back = changed.clone();
+        for own in own_lines(&changed).iter().rev().filter(|own| own.device == "x") {
+            back = without(&back, own);
         }
-        assert_eq!(changed, text);
-        let new: String = splices.into_iter().map(|(_, splice)| splice.new).collect();
-        (!new.is_empty()).then_some(new)
+        assert_eq!(back.trim_end_matches(['\r', '\n']), text.trim_end_matches(['\r', '\n']), "{changed:?}");
+        (changed != text).then(|| changed[text.len()..].to_owned())
     }
 
     #[test]
     fn a_line_that_is_on_is_not_written_again() {
+        const SPI: &[&str] = &["dtparam=spi=on"];
         for text in [
             "dtparam=spi=on",
             "dtparam=spi\n",
@@ -207,8 +277,9 @@ mod tests {
             "dtparam=spi=off\ndtparam=spi=1\n",
             "[none]\ndtparam=x\n[all]\ndtparam=spi=true\n",
             "[pi4]\ndtparam=spi=on\n",
+            "dtoverlay=w1-gpio\ndtparam=spi=on\n",
         ] {
-            assert_eq!(with(text, &["pi4"], SPI), None, "{text:?}");
+            assert_eq!(with(text, SPI), None, "{text:?}");
         }
         for text in [
             "",
@@ -217,52 +288,57 @@ mod tests {
             "dtparam=spi=on\ndtparam=spi=off\n",
             "[pi5]\ndtparam=spi=on\n",
             "[cm4]\ndtparam=spi=on\n[HDMI:0]\n",
+            "[EDID=x]\ndtparam=spi=on\n",
+            "[none]\n[pi4]\ndtparam=spi=on\n",
             "dtparam=spi2=on\n",
         ] {
-            assert_eq!(with(text, &["pi4"], SPI).unwrap(), "# pinion add x\n[all]\ndtparam=spi=on\n", "{text:?}");
+            assert_eq!(with(text, SPI).unwrap(), "# pinion add x\n[all]\ndtparam=spi=on\n", "{text:?}");
         }
-        assert_eq!(with("a=b", &[], SPI).unwrap(), "\n# pinion add x\n[all]\ndtparam=spi=on\n");
-        assert_eq!(with("a=b\r\n", &[], SPI).unwrap(), "# pinion add x\r\n[all]\r\ndtparam=spi=on\r\n");
+        assert_eq!(with("a=b", SPI).unwrap(), "\n# pinion add x\n[all]\ndtparam=spi=on\n");
+        assert_eq!(with("a=b\r\n", SPI).unwrap(), "# pinion add x\r\n[all]\r\ndtparam=spi=on\r\n");
         let two = &["dtparam=spi=on", "core_freq=250"];
-        assert_eq!(with("core_freq=250\ncore_freq=400\ndtparam=spi=on", &[], two).unwrap().matches('=').count(), 1);
-        assert_eq!(with("dtoverlay=w1-gpio,gpiopin=5\n", &[], &["dtoverlay=w1-gpio"]), None);
-        for (text, line) in [
-            ("dtoverlay=w1-gpio\n", None),
-            ("dtoverlay=w1-gpio,pullup=1,gpiopin=27\n", Some(27)),
-            ("dtoverlay=w1-gpio,gpiopin=27\n[none]\ndtoverlay=w1-gpio,gpiopin=5\n", Some(27)),
-            ("#dtoverlay=w1-gpio,gpiopin=27\n", None),
-            ("dtoverlay=w1-gpio,gpiopin=x\n", None),
-        ] {
-            assert_eq!(w1_line(text, &[]), line, "{text:?}");
-        }
+        assert_eq!(with("core_freq=250\ncore_freq=400\ndtparam=spi=on", two).unwrap().matches('=').count(), 1);
+        assert_eq!(with("dtoverlay=w1-gpio,gpiopin=5\n", &["dtoverlay=w1-gpio"]), None);
         let adc = &["dtoverlay=anyspi:spi0-0,dev=\"microchip,mcp3208\""];
-        assert!(with("dtoverlay=anyspi:spi0-1,dev=\"a,b\"\n", &[], adc).is_some());
-        assert_eq!(
-            with(
-                "dtparam=i2c1=on,i2c1_baudrate=400000",
-                &[],
-                &["dtparam=i2c_arm=on", "dtparam=i2c_arm_baudrate=400000"]
-            ),
-            None
-        );
+        assert!(with("dtoverlay=anyspi:spi0-1,dev=\"microchip,mcp3208\"\n", adc).is_some());
+        assert_eq!(with(&format!("{},speed=9\n", adc[0]), adc), None);
+        let clock = &["dtparam=i2c_arm=on", "dtparam=i2c_arm_baudrate=400000"];
+        assert_eq!(with("dtparam=i2c1=on,i2c1_baudrate=400000", clock), None);
+    }
+
+    /// The user has written behind our line since, and relies on its section.
+    #[test]
+    fn lines_of_the_user_stay_in_the_section_that_they_had() {
+        let own = "# pinion add x\n[all]\ndtparam=spi=on\n";
+        let back = |text: &str| without(text, &own_lines(text)[0]);
+        assert_eq!(back(&format!("[cm5]\na=b\n{own}c=d\n")), "[cm5]\na=b\n[all]\nc=d\n");
+        assert_eq!(back(&format!("[cm5]\na=b\n{own}[pi4]\nc=d\n")), "[cm5]\na=b\n[pi4]\nc=d\n");
+        assert_eq!(back(&format!("a=b\n{own}c=d\n")), "a=b\nc=d\n");
+        // Somebody has changed it, and so it is theirs.
+        for changed in
+            ["# pinion add x\n[all]\n#dtparam=spi=on\n", "# pinion add x\n[pi4]\ndtparam=spi=on\n", "dtparam=spi=on\n"]
+        {
+            assert_eq!(own_lines(changed), [], "{changed}");
+        }
+        assert_eq!(handed_over(own, &own_lines(own)[0], "y"), own.replace('x', "y"));
     }
 
     fn cb1(text: &str, files: &[&str]) -> Result<String, String> {
-        let catalog = Catalog::read().unwrap();
         let tree = Tree::new();
         tree.put("proc/device-tree/model", "BigTreeTech CB1\0");
-        let bus = &catalog.board(&tree.computer()).unwrap().bus[&Kind::Spi];
+        let board = Board::of(&tree.computer(), None).unwrap().unwrap();
         let files: BTreeSet<String> = files.iter().map(|file| (*file).to_owned()).collect();
-        let splices = overlays(text, bus, &files)?;
-        let mut changed = text.to_owned();
-        splices.iter().for_each(|splice| splice.apply(&mut changed));
-        let result = changed.clone();
-        assert_eq!(overlays(&changed, bus, &files), Ok(vec![]), "{changed}");
-        for splice in splices.iter().rev() {
-            splice.revert(&mut changed).unwrap();
+        let bus = &board.bus[&Kind::Spi];
+        let changed = overlays(text, bus, &files, "x")?;
+        assert_eq!(overlays(&changed, bus, &files, "x").as_ref(), Ok(&changed), "a second time");
+        let mut left = Vec::new();
+        let back = without_settings(&changed, "x", &mut left);
+        let empty = text.lines().filter(|line| !line.trim_end().ends_with("overlays=")).count() < text.lines().count();
+        if !empty {
+            assert_eq!(back.trim_end(), text.trim_end(), "{changed}");
         }
-        assert_eq!(changed, text);
-        Ok(result)
+        assert!(left.is_empty(), "{left:?}");
+        Ok(changed)
     }
 
     #[test]
@@ -270,20 +346,20 @@ mod tests {
         let new = &["sun50i-h616-spidev1_1", "sun50i-h616-spi-spidev"];
         let head = "bootlogo=true\noverlay_prefix=sun50i-h616\n";
         let after = |rest: &str| cb1(&format!("{head}{rest}"), new).map(|text| text[head.len()..].to_owned());
-        assert_eq!(
-            after("overlays=ws2812 light\nrootdev=UUID=1\n").unwrap(),
-            "overlays=ws2812 light spidev1_1\nrootdev=UUID=1\n"
-        );
-        assert_eq!(after("overlays=a\noverlays=b\n").unwrap(), "overlays=a\noverlays=b spidev1_1\n");
-        assert_eq!(after("#overlays=a\n").unwrap(), "#overlays=a\noverlays=spidev1_1\n");
-        assert_eq!(after("rootdev=1").unwrap(), "rootdev=1\noverlays=spidev1_1\n");
-        assert_eq!(after("overlays=\r\nx=y\r\n").unwrap(), "overlays=spidev1_1\r\nx=y\r\n");
-        assert_eq!(after("overlays= ").unwrap(), "overlays=spidev1_1 ");
+        let mark = "# pinion add x: overlays+=spidev1_1\n";
+        for (before, expected) in [
+            ("overlays=ws2812 light\nrootdev=UUID=1\n", "overlays=ws2812 light spidev1_1\nrootdev=UUID=1\n"),
+            ("overlays=a\noverlays=b\n", "overlays=a\noverlays=b spidev1_1\n"),
+            ("#overlays=a\n", "#overlays=a\noverlays=spidev1_1\n"),
+            ("rootdev=1", "rootdev=1\noverlays=spidev1_1\n"),
+            ("overlays=\n", "overlays=spidev1_1\n"),
+        ] {
+            assert_eq!(after(before).unwrap(), format!("{expected}{mark}"));
+        }
+        assert_eq!(after("overlays=a\r\n").unwrap(), "overlays=a spidev1_1\r\n# pinion add x: overlays+=spidev1_1\r\n");
         for on in ["overlays=x spidev1_1\n", "overlays=sun50i-h616-spidev1_1\n"] {
             assert_eq!(after(on).unwrap(), on);
         }
-        let error = after("overlays=mcp2515\n").unwrap_err();
-        assert_eq!(error, "the overlay mcp2515 uses spidev1.1 already: remove it from overlays=");
     }
 
     #[test]
@@ -292,22 +368,30 @@ mod tests {
         let text = cb1("overlay_prefix=sun50i-h616\nparam_spidev_spi_bus=0\n", old).unwrap();
         assert_eq!(
             text,
-            "overlay_prefix=sun50i-h616\nparam_spidev_spi_bus=1\noverlays=spi-spidev\nparam_spidev_spi_cs=1\n"
+            "overlay_prefix=sun50i-h616\nparam_spidev_spi_bus=1\noverlays=spi-spidev\n\
+             # pinion add x: overlays+=spi-spidev\n# pinion add x: param_spidev_spi_bus=1, was 0\n\
+             param_spidev_spi_cs=1\n# pinion add x: param_spidev_spi_cs=1, not set\n"
         );
         // The name may have the prefix already, or none (armbian-mkspi#49).
         assert!(cb1("overlay_prefix=rockchip\n", &["spi-spidev"]).unwrap().contains("overlays=spi-spidev\n"));
         let error = cb1("overlay_prefix=rockchip\n", &["rockchip-rk3328-spi-spidev", "i2c0"]).unwrap_err();
         assert!(error.contains("which has rockchip-rk3328-spi-spidev: write"), "{error}");
         assert!(cb1("", &[]).unwrap_err().contains("no overlay for spidev1.1"));
+        // A value that begins like ours is the user's.
+        let mut left = Vec::new();
+        let changed = text.replace("param_spidev_spi_bus=1\n", "param_spidev_spi_bus=10\n");
+        let back = without_settings(&changed, "x", &mut left);
+        assert_eq!(back, "overlay_prefix=sun50i-h616\nparam_spidev_spi_bus=10\n");
+        assert_eq!(left, ["param_spidev_spi_bus is not 1 any more, and stays"]);
     }
 
     proptest! {
-        /// Whatever the file holds, a second time changes nothing, and the way back ends at the same bytes.
+        /// Whatever the file holds, a second time changes nothing, and the way back ends at the same lines.
         #[test]
         fn settings_are_found_again_and_taken_back(
-            text in "(dtparam=(spi|i2c)(=on|=off)?|\\[(all|pi4|none)\\]|#|overlays=[a-z ]{0,5}|param_spidev_spi_cs=[01]|\\PC{0,9}|\r?\n|\n){0,12}"
+            text in "(dtparam=(spi|i2c)(=on|=off)?|\\[(all|pi4|none)\\]|#|overlays=[a-z]{1,5}|param_spidev_spi_cs=[01]|\\PC{0,9}|\n){0,12}"
         ) {
-            with(&text, &["pi4"], &["dtparam=spi=on", "dtparam=i2c_arm=on", "core_freq=250"]);
+            with(&text, &["dtparam=spi=on", "dtparam=i2c_arm=on", "core_freq=250"]);
             for file in ["spidev1_1", "spi-spidev"] {
                 let _ = cb1(&text, &[file]);
             }

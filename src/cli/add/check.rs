@@ -1,29 +1,35 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Asks the device, before anything is written to printer.cfg.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use pinion_printer_config::Section;
 use serde_json::json;
 
+use crate::cli::computer::board::{Board, Kind, Spot};
 use crate::cli::computer::{Access, Computer};
 use crate::cli::quietly;
 
-use super::Work;
-use super::board::{KnownBoard, Spot};
 use super::catalog::Check;
-use super::printer::Printer;
+use super::command;
+use super::printer::Target;
 use super::probe::{self, Answer};
+use super::work::Work;
 
 /// How often a chip's driver is asked for a value.
 const SAMPLES: usize = 8;
 
 impl Work<'_> {
     /// Asks the device. Returns its I2C address.
-    pub(super) fn check(&mut self, printer: Option<&Printer>) -> Result<Option<u8>, String> {
+    pub(super) fn check(&mut self, printer: Option<&Target>) -> Result<Option<u8>, String> {
         let node = self.node().to_owned();
         let mut checks = Vec::new();
         let path = format!("/dev/{node}");
-        if let Ok(about) = std::fs::metadata(self.computer.path(&path)) {
+        // Lines have no node of their own.
+        if self.way.bus != Kind::Line
+            && let Ok(about) = std::fs::metadata(self.computer.path(&path))
+        {
             checks.push(format!("{path} is there"));
             if let Some(user) = self.computer.user("pinion")
                 && !user.may(Access::READ_WRITE, &about)
@@ -32,6 +38,7 @@ impl Work<'_> {
             }
         }
         checks.extend(strays(self.computer, self.board, &self.spot));
+        let addresses = self.search.addresses(self.way, &self.spot);
         let asked = match (&self.way.check, self.way.driver.is_some()) {
             (Some(Check::W1), _) => match self.thermometer(printer) {
                 Some(serial) => Ok(Answer { text: format!("the thermometer {serial} answers"), address: None }),
@@ -41,7 +48,7 @@ impl Work<'_> {
             },
             (Some(Check::Iio { file, highest }), _) => self.sample(file, *highest),
             (Some(_), false) => match probe::Live::of(&node) {
-                Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &mut live)),
+                Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &addresses, &mut live)),
                 None => Err(format!("{node} is no bus")),
             },
             _ => Ok(Answer { text: "it cannot be asked: try it out".into(), address: None }),
@@ -55,7 +62,7 @@ impl Work<'_> {
         self.report.show()?;
         match asked {
             Ok(answer) => Ok(answer.address),
-            Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, self.command())),
+            Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, command(self.args, false))),
         }
     }
 
@@ -78,8 +85,13 @@ impl Work<'_> {
     }
 
     /// A thermometer that printer.cfg does not have yet.
-    pub(super) fn thermometer(&self, printer: Option<&Printer>) -> Option<String> {
-        let known = printer.map(|printer| printer.serials(self.device)).unwrap_or_default();
+    pub(super) fn thermometer(&self, printer: Option<&Target>) -> Option<String> {
+        let own = printer.map(|printer| printer.file(&self.device.file(self.name())));
+        let others = printer.zip(own.as_deref()).map(|(printer, own)| printer.others(own));
+        // A section that is there already keeps its thermometer.
+        let is_other = |section: &&Section| self.search.there.as_ref() != Some(&section.name);
+        let known: BTreeSet<&str> =
+            others.into_iter().flatten().filter(is_other).filter_map(|section| section.text("serial_no")).collect();
         let found = self.computer.matching("/sys/bus/w1/devices/28-*");
         let names = found.iter().filter_map(|path| path.file_name()?.to_str());
         let is_serial = |name: &&str| name.chars().all(|c| c.is_ascii_hexdigit() || c == '-');
@@ -103,7 +115,7 @@ fn judge(file: &str, values: &[u32], highest: u32) -> Result<String, String> {
 }
 
 /// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
-fn strays(computer: &Computer, board: &KnownBoard, spot: &Spot) -> Vec<String> {
+fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
     let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
     let is_header = |path: &&PathBuf| {
         let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
@@ -130,10 +142,8 @@ fn strays(computer: &Computer, board: &KnownBoard, spot: &Spot) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
 
     use super::*;
-    use crate::cli::add::catalog::Catalog;
     use crate::cli::computer::tests::Tree;
 
     #[test]
@@ -161,11 +171,10 @@ mod tests {
                     pin 10 (gpio10) function gpio_in in lo; irq 0 (none)\n\
                     pin 11 (gpio11) function alt0 in lo; irq 0 (none)\n";
         tree.put("sys/kernel/debug/pinctrl/fe200000.gpio-pinctrl-bcm2711/pins", pins);
-        let catalog = Catalog::read().unwrap();
         let computer = tree.computer();
-        let board = catalog.board(&computer).unwrap();
-        let spot = board.spot(&catalog.device("adxl345").unwrap().way[0], &|_, _| None, &BTreeSet::new()).unwrap();
-        let found = strays(&computer, board, &spot);
+        let board = Board::of(&computer, None).unwrap().unwrap();
+        let spot = board.bus[&Kind::Spi].spots().next().unwrap();
+        let found = strays(&computer, &board, &spot);
         assert_eq!(found.len(), 1, "{found:?}");
         assert!(found[0].starts_with("pin 19 (GPIO10 MOSI) is a GPIO line now"), "{found:?}");
     }

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::Work;
 use super::moonraker::{Host, Moonraker};
+use super::work::Work;
 
 /// How long a fan may take until its tachometer counts. klippy reports a speed each second.
 const SPIN_UP: Duration = Duration::from_secs(6);
@@ -16,8 +16,8 @@ const FIRST_VALUE: Duration = Duration::from_secs(8);
 
 impl Work<'_> {
     /// Restarts the host, and asks it for a first value.
-    pub(super) fn measure(&mut self, is_changed: bool) -> Result<(), String> {
-        let moonraker = Moonraker(&self.args.moonraker);
+    pub(super) fn measure(&mut self, moonraker: &str, is_changed: bool) -> Result<(), String> {
+        let moonraker = Moonraker(moonraker);
         let left = match moonraker.host() {
             Host::Rests => None,
             Host::Prints => Some("the host prints: run FIRMWARE_RESTART after the print".to_owned()),
@@ -37,9 +37,10 @@ impl Work<'_> {
 
     /// The host's first measurement with the device, in words.
     fn first_value(&self, moonraker: &Moonraker) -> Result<String, String> {
-        let section = &self.device.section;
+        let section = &self.section();
         if self.device.resonance {
-            let lines = moonraker.run(&format!("ACCELEROMETER_QUERY CHIP={section}"))?;
+            let chip = section.rsplit(' ').next().unwrap_or_default();
+            let lines = moonraker.run(&format!("ACCELEROMETER_QUERY CHIP={chip}"))?;
             let values = lines.iter().find_map(|line| acceleration(line));
             return values.ok_or_else(|| "ACCELEROMETER_QUERY answers no values: see klippy.log".to_owned())?;
         }
@@ -60,7 +61,8 @@ impl Work<'_> {
             };
         }
         if let Some(command) = &self.device.measure {
-            let lines = moonraker.run(command)?;
+            let command = self.device.named(command, self.name());
+            let lines = moonraker.run(&command)?;
             let lines: Vec<&str> = lines.iter().map(|line| line.trim_start_matches("// ")).collect();
             return Ok(format!("{command}: {}", lines.join("; ")));
         }

@@ -4,32 +4,47 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use pinion_printer_config::{Section, Setting};
+
 use crate::cli::computer::Computer;
+use crate::cli::computer::printer::Printer;
 use crate::cli::finding::Finding;
 
 use super::catalog::{Catalog, Device};
-use super::printer::Printer;
 
 /// The finding of `pinion doctor`: the devices of these configurations whose bus is not there, and how to get it.
 pub(in crate::cli) fn missing(computer: &Computer, configs: &BTreeSet<PathBuf>) -> Vec<Finding> {
     let Ok(catalog) = Catalog::read() else { return Vec::new() };
     let printers = configs.iter().filter_map(|config| Printer::read(computer, config).ok());
-    let finding = |printer: Printer| -> Vec<Finding> {
-        let of = |(section, sensor, file): (&str, Option<&str>, String)| {
-            let found = format!("[{section}] in printer.cfg needs {file}, which is not there");
-            let kind = section.split(' ').next().unwrap_or_default();
-            let is_it = |device: &&Device| match sensor {
-                Some(sensor) => device.way.iter().any(|way| way.config.contains(&format!("sensor_type: {sensor}\n"))),
-                None => device.section.split(' ').next() == Some(kind),
-            };
-            match catalog.devices.iter().find(is_it) {
-                Some(device) => Finding::error("device", found, format!("sudo pinion add {}", device.name)),
-                None => Finding::error("device", found, "enable its bus: pinion add lists what it knows"),
-            }
+    let finding = |section: &Section| {
+        let file = section.settings().iter().find_map(node).filter(|file| !computer.exists(file))?;
+        let found = format!("[{}] in printer.cfg needs {file}, which is not there", section.name);
+        let is_it = |device: &&Device| {
+            device.is_chip_of(section)
+                || section.kind() == device.section(None).split(' ').next().unwrap_or_default()
+                    && device.name == "ws2812"
         };
-        printer.absent(computer).into_iter().map(of).collect()
+        let remedy = match catalog.devices.iter().find(is_it) {
+            Some(device) => format!("sudo pinion add {}{}", device.name, computer.root_option()),
+            None => "enable its bus: pinion add lists what it knows".into(),
+        };
+        Some(Finding::error("device", found, remedy))
     };
-    printers.flat_map(finding).collect()
+    printers.flat_map(|printer| printer.config.sections().iter().filter_map(finding).collect::<Vec<_>>()).collect()
+}
+
+/// The file of a bus or a sensor that an option names.
+fn node(setting: &Setting) -> Option<String> {
+    let name = setting.value.rsplit(':').next().unwrap_or_default().trim_start_matches(['^', '~', '!', ' ']).trim();
+    let is_number = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || c == '.');
+    match (setting.key.as_str(), name.strip_prefix("spidev"), name.strip_prefix("i2c.")) {
+        ("spi_bus" | "pin", Some(number), _) if is_number(number) => Some(format!("/dev/{name}")),
+        ("i2c_bus", _, Some(number)) if is_number(number) => Some(format!("/dev/i2c-{number}")),
+        ("serial_no", ..) if name.chars().all(|c| c.is_ascii_hexdigit() || c == '-') => {
+            Some(format!("/sys/bus/w1/devices/{name}"))
+        }
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -47,7 +62,9 @@ mod tests {
             .iter()
             .map(|finding| {
                 let found = finding.trouble.found();
-                (found.split(']').next().unwrap().to_owned(), finding.trouble.remedy.clone().unwrap_or_default().into())
+                let remedy: String = finding.trouble.remedy.clone().unwrap_or_default().into();
+                let root = tree.computer().root_option();
+                (found.split(']').next().unwrap().to_owned(), remedy.replace(&root, ""))
             })
             .collect();
         let expected = [

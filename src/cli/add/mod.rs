@@ -5,78 +5,86 @@
 //! restart, and measures. A call that ends at a reboot or at a wrong wire goes on when it is repeated: each step first
 //! checks if it is done.
 
-use std::collections::BTreeSet;
 use std::io::{self, BufRead as _, IsTerminal as _};
 use std::path::PathBuf;
-use std::process::{Command, ExitCode};
+use std::process::ExitCode;
 
 use clap::{Args, ValueHint};
 use nix::unistd::geteuid;
 use serde_json::{Value, json};
 
+use super::complete::offering;
 use super::computer::Computer;
+use super::computer::board::{self, Board, Kind, Spot};
+use super::computer::uses::{Resource, Source, Uses};
 use super::failed;
-use super::files::Output;
+use pinion_linux::Inventory;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::process::Process;
 
-mod board;
 mod boot;
-mod bus;
 mod catalog;
-mod change;
 mod check;
 mod list;
 mod measure;
 mod missing;
 mod moonraker;
-mod picture;
+pub(super) mod picture;
+mod place;
+mod plan;
 mod printer;
 mod probe;
 mod report;
 mod rights;
-mod splice;
+mod side;
 mod undo;
+mod work;
 
-use board::{KnownBoard, Spot, Wire};
-use bus::State;
-use catalog::{Catalog, Device, Kind, Way};
-use change::{Change, Record, Side, copy_of};
+use catalog::{Catalog, Device, Way};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};
-use printer::Printer;
+use place::Search;
+pub(super) use place::Wire;
+use printer::Target;
 use report::Report;
+use side::{Edit, Side};
+use work::Work;
 
-/// The folder of the records of root's files.
-const STATE: &str = "/var/lib/pinion-mcu/add";
-/// Where Moonraker answers, if nobody says otherwise.
-const MOONRAKER: &str = "127.0.0.1:7125";
-/// The key of the change of the boot loader's settings, with the bus behind it.
-const BUS: &str = "bus";
+/// The buses that a user may choose between.
+const BUSES: &[&str] = &["spi", "i2c"];
 
 /// Options of `pinion add`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct AddArgs {
     /// The device. Without it, list what can be added here
-    #[arg(value_name = "DEVICE", value_hint = ValueHint::Other)]
+    #[arg(value_name = "DEVICE", value_parser = offering::<String>(&catalog::NAMES), hide_possible_values = true)]
     device: Option<String>,
+    /// Give it this name, for a second device of the kind
+    #[arg(long, value_name = "NAME", requires = "device", value_hint = ValueHint::Other)]
+    name: Option<String>,
     /// Connect it in this way, if the device has several: spi or i2c
-    #[arg(long, value_name = "BUS", value_hint = ValueHint::Other)]
+    #[arg(long, value_name = "BUS", value_parser = offering::<String>(BUSES), hide_possible_values = true)]
     bus: Option<String>,
-    /// Use this pin of the header, such as 11, for the device's line
-    #[arg(long, value_name = "NUMBER")]
-    pin: Option<usize>,
+    /// Use this pin of the header, such as 11 or GPIO17, for the device's line
+    #[arg(long, value_name = "PIN", value_hint = ValueHint::Other)]
+    pin: Option<String>,
     /// Write a picture of the wires to this SVG file
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    #[arg(long, value_name = "FILE", requires = "device", conflicts_with = "undo", value_hint = ValueHint::FilePath)]
     picture: Option<PathBuf>,
     /// The host's configuration [default: that of the only klippy]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
-    /// Where Moonraker answers
-    #[arg(long, value_name = "ADDRESS", default_value = MOONRAKER, value_hint = ValueHint::Other)]
-    moonraker: String,
+    /// This computer's MCU in the configuration, if its link does not say so
+    #[arg(long, value_name = "NAME", value_hint = ValueHint::Other)]
+    mcu: Option<String>,
+    /// Where Moonraker answers [default: as moonraker.conf beside the configuration says]
+    #[arg(long, value_name = "ADDRESS", value_hint = ValueHint::Other)]
+    moonraker: Option<String>,
+    /// The board, if its device tree is not there, as on a mounted card
+    #[arg(long, value_name = "BOARD", value_parser = offering::<String>(&board::NAMES), hide_possible_values = true)]
+    board: Option<String>,
     /// Show what would be done, and change nothing
-    #[arg(long, conflicts_with = "undo")]
+    #[arg(long)]
     dry_run: bool,
     /// Take back what was changed for the device
     #[arg(long, requires = "device")]
@@ -115,31 +123,93 @@ pub(super) fn run(args: &AddArgs) -> ExitCode {
 
 fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(), String> {
     let catalog = Catalog::read()?;
-    let board = catalog.board(computer);
-    let model = catalog::model(computer);
+    let board = Board::of(computer, args.board.as_deref())?;
+    let model = board::model(computer);
     report.set("model", json!(model));
-    report.set("board", json!(board.map(|board| &board.name)));
-    let Some(name) = &args.device else {
-        return list::list(&catalog, board, &model, report);
+    report.set("board", json!(board.as_ref().map(|board| &board.name)));
+    let target = Target::find(computer, args.config.as_deref(), args.mcu.as_deref());
+    let lacks = |device: &Device| {
+        let klippy = target.as_ref().ok()?.klippy(computer)?;
+        printer::lacks(&klippy, device.module())
     };
-    let device = catalog.device(name).ok_or_else(|| list::unknown_device(&catalog, name))?;
+    let Some(name) = &args.device else {
+        return list::list(&catalog, board.as_ref(), &model, &lacks, report);
+    };
+    let device = catalog.device(name)?;
     report.set("device", json!(device.name));
+    if let Some(name) = args.name.as_deref()
+        && !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+    {
+        return Err("--name: a name has letters, digits and _".into());
+    }
+    if args.name.is_some()
+        && device.wants_first
+        && target.as_ref().is_ok_and(|target| target.config().section(&device.section(None)).is_none())
+    {
+        return Err(format!("--name: the first one has no name: pinion add {}", device.name));
+    }
+    let driver = device.way.iter().find_map(|way| way.driver.as_deref()).filter(|_| args.name.is_some());
+    if let Some(driver) = driver.filter(|_| !args.undo) {
+        return Err(format!(
+            "--name: only one {driver} has a name in printer.cfg, because its channels have the driver's"
+        ));
+    }
+    if args.config.is_some()
+        && let Err(why) = &target
+    {
+        return Err(why.clone());
+    }
+    let inventory = computer.is_this().then(Inventory::scan);
+    let config = target.as_ref().ok().map(|target| (target.path.as_path(), args.mcu.as_deref()));
+    let uses = Uses::find(computer, board.as_ref(), config, inventory.as_ref());
     if args.undo {
-        return undo::undo(args, computer, &catalog, device, report);
+        return undo::undo(args, computer, &catalog, device, target, &uses, report);
     }
     let board = board.ok_or_else(|| list::unknown_board(&model))?;
-    let ways = ways(board, device, args.bus.as_deref())?;
-    let printer = Printer::find(computer, args.config.as_deref());
-    if args.config.is_some() {
-        printer.as_ref().map_err(String::clone)?;
+    if let Some(folder) = lacks(device) {
+        let folder = computer.name(&folder);
+        return Err(format!(
+            "the host in {} has no module {}: update it, or use another device",
+            folder.display(),
+            device.module()
+        ));
     }
-    let (way, spot) = place(board, device, &ways, printer.as_ref().ok(), report)?;
-    let mut work = Work { args, computer, catalog: &catalog, board, device, way, spot, report };
-    work.run(printer)
+    let ways = ways(&board, device, args.bus.as_deref())?;
+    let own = target.as_ref().ok().map(|target| target.file(&device.file(args.name.as_deref())));
+    let there = target.as_ref().ok().map(|target| existing(target, device, args)).transpose()?.flatten();
+    let search = Search { board: &board, uses: &uses, own: own.as_deref(), there };
+    let (way, spot) = place(&search, device, &ways, args, report)?;
+    let mut work = Work { args, computer, catalog: &catalog, board: &board, device, way, spot, search, report };
+    work.run(target)
+}
+
+/// A section of printer.cfg, outside of the device's own file, that is this device on this computer.
+///
+/// # Errors
+///
+/// One line: the name is another device's, on another MCU.
+fn existing(target: &Target, device: &Device, args: &AddArgs) -> Result<Option<String>, String> {
+    let own = target.file(&device.file(args.name.as_deref()));
+    let wanted = device.section(args.name.as_deref());
+    let named = target.others(&own).find(|section| section.name == wanted);
+    if let Some(section) = named.filter(|section| !target.is_here(section)) {
+        return Err(format!(
+            "[{wanted}] ({}) is on the MCU {}: give this one another name: pinion add {} --name NAME",
+            section.place,
+            target.mcu_of(section),
+            device.name
+        ));
+    }
+    let is_it = |section: &&pinion_printer_config::Section| {
+        device.is_chip_of(section) && target.is_here(section) && !target.is_pinion_s(section)
+    };
+    let has_own = target.config().section(&wanted).is_some_and(|section| target.is_in(section, &own));
+    let other = named.or_else(|| target.others(&own).find(is_it).filter(|_| args.name.is_none() && !has_own));
+    Ok(other.map(|section| section.name.clone()))
 }
 
 /// The ways to connect a device to this board, the best one first: all of them, or the one that is named.
-fn ways<'a>(board: &KnownBoard, device: &'a Device, wanted: Option<&str>) -> Result<Vec<&'a Way>, String> {
+fn ways<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result<Vec<&'a Way>, String> {
     let wanted = wanted.map(str::to_ascii_lowercase);
     let is_wanted = |way: &&Way| match wanted.as_deref() {
         None => true,
@@ -152,65 +222,99 @@ fn ways<'a>(board: &KnownBoard, device: &'a Device, wanted: Option<&str>) -> Res
     if ways.is_empty() {
         return Err(format!("--bus: {} is connected by {}", device.name, kinds.join(" or ")));
     }
-    let ways: Vec<&Way> = ways.into_iter().filter(|way| board.has(way)).collect();
+    let ways: Vec<&Way> = ways.into_iter().filter(|way| way.fits(board)).collect();
     match ways.is_empty() {
         false => Ok(ways),
         true => Err(format!(
-            "{} has no known {} on its header: see docs/guide/pins.md for what you can do by hand",
-            board.name,
-            kinds.join(" or ")
+            "Pinion knows no {} on the header of a {}: see {PINS} for what you can do by hand",
+            kinds.join(" or "),
+            board.name
         )),
     }
 }
 
-/// The way and the place of a device: those of an earlier call, or the first ones that are free.
+/// The page about pins, in the package.
+const PINS: &str = "/usr/share/doc/pinion-mcu/guide/pins.md";
+
+/// The way and the place of a device: those of an earlier call, or of a section that is there, or the first ones that are
+/// free.
 fn place<'a>(
-    board: &KnownBoard,
+    search: &Search,
     device: &Device,
     ways: &[&'a Way],
-    printer: Option<&Printer>,
+    args: &AddArgs,
     report: &mut Report,
 ) -> Result<(&'a Way, Spot), String> {
-    let all = ways.iter().flat_map(|way| board.spots(way).map(move |spot| (*way, spot)));
-    if let Some(printer) = printer
-        && let Some(found) = all.into_iter().find(|(way, spot)| printer.has_placed(device, way.bus, &spot.node))
-    {
+    let all = |ways: &[&'a Way]| -> Vec<(&'a Way, Spot)> {
+        ways.iter().flat_map(|way| search.spots(way).into_iter().map(|spot| (*way, spot))).collect()
+    };
+    let section = search.there.as_ref().map(|name| format!("[{name}]"));
+    let is_placed = |(way, spot): &(&Way, Spot)| {
+        let mut own = search.uses.all.iter().filter(|one| match &section {
+            Some(section) => one.user == *section && matches!(one.source, Source::Printer(_)),
+            None => search.own.is_some_and(|own| Target::is_use_of(one, own)),
+        });
+        own.any(|one| match &one.what {
+            Resource::I2c(bus, _) => spot.node == format!("i2c-{bus}"),
+            Resource::Sensor(_) => way.bus == Kind::W1,
+            Resource::Controller(bus) => board::function(&spot.node) == format!("spi{bus}"),
+            // The driver of an ADC has its chip select in config.txt.
+            other => spot.node == other.to_string(),
+        })
+    };
+    if let Some(found) = all(ways).into_iter().find(is_placed) {
         return Ok(found);
     }
-    let uses = |kind: Kind, node: &str| printer?.user(device, kind, node);
-    let taken = printer.map(|printer| printer.taken(device)).unwrap_or_default();
+    if let Some((way, _)) =
+        device.way.iter().flat_map(|way| search.spots(way).into_iter().map(move |spot| (way, spot))).find(is_placed)
+        && args.bus.is_some()
+    {
+        return Err(format!(
+            "--bus: {} is connected by {} already: take it back with --undo first, or add a second one with --name",
+            device.name,
+            way.bus.name()
+        ));
+    }
     let mut refusal = None;
     for way in ways {
-        match board.spot(way, &uses, &taken) {
-            Ok(spot) => {
-                if let Some(why) = refusal {
-                    report.set("conflict", json!(why));
-                    report.line(format_args!("{why}: so it is connected by {}.", way.bus.name()));
-                    report.line("");
+        for spot in search.spots(way) {
+            match search.conflict(way, &spot) {
+                None => {
+                    if let Some((why, _)) = refusal.filter(|(_, kind)| *kind != way.bus) {
+                        report.set("conflict", json!(why));
+                        report.line(format_args!("{why}: so it is connected by {}.", way.bus.name()));
+                        report.line("");
+                    }
+                    return Ok((way, spot));
                 }
-                return Ok((way, spot));
+                Some(why) => refusal = refusal.or(Some((why, way.bus))),
             }
-            Err(why) => refusal = refusal.or(Some(why)),
         }
     }
-    Err(format!("{}: pins.md says how chips share a bus (docs/guide/pins.md)", refusal.unwrap_or_default()))
+    let why = refusal.map(|(why, _)| why).unwrap_or_default();
+    Err(format!(
+        "{why}, and nothing else is free for {}: see pinion pins --used, and {PINS} for how chips share a bus",
+        device.name
+    ))
 }
 
-/// The sides of the computer: root's files, and those of printer.cfg's owner.
-fn system(computer: &Computer) -> Side<'_> {
-    Side { computer, owner: None, records: STATE.into() }
-}
-
-fn host<'a>(computer: &'a Computer, printer: &Printer) -> Side<'a> {
-    Side { computer, owner: Some(printer.owner), records: printer.folder() }
+/// The Moonraker of a printer. `None` for another computer's, unless it is named.
+fn moonraker_of(
+    args: &AddArgs,
+    computer: &Computer,
+    target: Result<&Target, &String>,
+) -> Result<Option<String>, String> {
+    match (&args.moonraker, target) {
+        (Some(address), _) => Ok(Some(address.clone())),
+        (None, Ok(target)) if computer.is_this() => target.moonraker(computer).map(Some),
+        _ => Ok(None),
+    }
 }
 
 /// Fails if the host prints, or if nobody says whether it does.
-fn refuse_while_printing(args: &AddArgs, computer: &Computer) -> Result<(), String> {
-    if !computer.is_this() && args.moonraker == MOONRAKER {
-        return Ok(());
-    }
-    match Moonraker(&args.moonraker).host() {
+fn refuse_while_printing(computer: &Computer, moonraker: Option<&str>) -> Result<(), String> {
+    let Some(address) = moonraker else { return Ok(()) };
+    match Moonraker(address).host() {
         Host::Rests => Ok(()),
         Host::Prints => Err("the host prints: call it again when the print has ended".into()),
         Host::Unknown(_) if computer.processes(Process::is_klippy).next().is_none() => Ok(()),
@@ -221,230 +325,100 @@ fn refuse_while_printing(args: &AddArgs, computer: &Computer) -> Result<(), Stri
     }
 }
 
-/// Asks before a change.
-fn ask(args: &AddArgs, computer: &Computer, report: &mut Report, question: &str) -> Result<(), String> {
-    const REFUSED: &str = "nothing is changed";
+/// Asks before a change. `done` are the files that this call has changed already.
+fn ask(
+    args: &AddArgs,
+    computer: &Computer,
+    moonraker: Option<&str>,
+    report: &mut Report,
+    question: &str,
+) -> Result<(), String> {
+    let refused = match report.changed.is_empty() {
+        true => "nothing is changed".to_owned(),
+        false => format!("the rest is not changed, but {} is", report.changed.join(", ")),
+    };
     if args.yes {
         return Ok(());
     }
     if args.json || !io::stdin().is_terminal() {
-        return Err(format!("{REFUSED}: nobody can be asked here: call it with --yes"));
+        return Err(format!("{refused}: nobody can be asked here: call it with --yes"));
     }
     report.line(format_args!("{question} [y/N]"));
     report.show()?;
     let mut answer = String::new();
-    io::stdin().lock().read_line(&mut answer).map_err(|error| format!("{REFUSED}: {error}"))?;
+    io::stdin().lock().read_line(&mut answer).map_err(|error| format!("{refused}: {error}"))?;
     match answer.trim().to_ascii_lowercase().as_str() {
         // A print may have begun before the answer.
-        "y" | "yes" => refuse_while_printing(args, computer),
-        _ => Err(REFUSED.into()),
+        "y" | "yes" => refuse_while_printing(computer, moonraker),
+        _ => Err(match report.changed.is_empty() {
+            true => refused,
+            false => format!("{refused}: {} takes that back", command(args, true)),
+        }),
     }
 }
 
-/// A device on its way into a printer.
-struct Work<'a> {
-    args: &'a AddArgs,
-    computer: &'a Computer,
-    catalog: &'a Catalog,
-    board: &'a KnownBoard,
-    device: &'a Device,
-    way: &'a Way,
-    /// The place on the bus.
-    spot: Spot,
-    report: &'a mut Report,
+/// The command that continues, or that takes all of it back, with all options of this call.
+fn command(args: &AddArgs, undo: bool) -> String {
+    let mut words = vec!["sudo pinion add".to_owned()];
+    words.extend(args.device.as_ref().map(word));
+    let mut option = |name: &str, value: Option<String>| {
+        words.extend(value.map(|value| format!("--{name} {}", word(value))));
+    };
+    option("name", args.name.clone());
+    option("mcu", args.mcu.clone());
+    if !undo {
+        option("bus", args.bus.clone());
+        option("pin", args.pin.clone());
+    }
+    let path = |path: &PathBuf| path.display().to_string();
+    option("config", args.config.as_ref().map(path));
+    option("moonraker", args.moonraker.clone());
+    option("board", args.board.clone());
+    option("root", Some(path(&args.root)).filter(|root| root != "/"));
+    if undo {
+        words.push("--undo".into());
+    }
+    words.join(" ")
 }
 
-impl Work<'_> {
-    /// Does it. Without a printer, all but its configuration.
-    fn run(&mut self, printer: Result<Printer, String>) -> Result<(), String> {
-        let taken = printer.as_ref().map(|printer| printer.taken(self.device)).unwrap_or_default();
-        self.move_w1()?;
-        let wires = self.board.wires(self.way, &self.spot, &taken, self.args.pin)?;
-        self.draw(&wires)?;
-        let rests = refuse_while_printing(self.args, self.computer);
-        let may_ask = rests.is_ok();
-        if !self.args.dry_run {
-            rests?;
-        }
-        let (boot, state) = self.plan_boot()?;
-        self.report.set("bus", json!(state.name()));
-        if !boot.changes.is_empty() {
-            self.make(&system(self.computer), &boot, "Change these files?")?;
-            let is_live = self.computer.is_this() && !self.args.dry_run;
-            if is_live && state == State::NotLoaded {
-                let loaded = Command::new("modprobe").arg("i2c-dev").status();
-                if !loaded.is_ok_and(|status| status.success()) {
-                    return Err("modprobe i2c-dev failed: reboot, then call this again".into());
-                }
-            } else if is_live {
-                self.report.set("reboot", json!(true));
-                self.report.line("The bus is there after a reboot. Connect the wires while the power is off:");
-                self.report.line("  sudo poweroff");
-                self.report.line(format_args!("Then call \"{}\" again.", self.command()));
-                return Ok(());
-            }
-        }
-        if self.computer.is_this() && state == State::Due && boot.changes.is_empty() {
-            return Err(format!("{} is enabled and not there: sudo reboot, then call this again", self.node()));
-        }
-        let address = match self.computer.is_this() && state == State::There && may_ask {
-            true => self.check(printer.as_ref().ok())?,
-            false => None,
+/// Shows changes, asks, and makes them.
+fn make(
+    args: &AddArgs,
+    moonraker: Option<&str>,
+    side: &Side,
+    edits: &[Edit],
+    question: &str,
+    report: &mut Report,
+) -> Result<(), String> {
+    let mut all = report.values.get("changes").and_then(Value::as_array).cloned().unwrap_or_default();
+    for edit in edits {
+        let (old, new) = edit.lines();
+        all.push(json!({ "file": edit.file, "old": old.join("\n"), "new": new.join("\n") }));
+        let how = match (&edit.old, &edit.new) {
+            (None, _) => "new file ",
+            (_, None) => "removed file ",
+            _ => "",
         };
-        self.configure(&printer?, &wires, address, boot.needs)
+        report.line(format_args!("{how}{}", edit.file.display()));
+        old.iter().for_each(|line| report.line(format_args!("- {line}")));
+        new.iter().for_each(|line| report.line(format_args!("+ {line}")));
     }
-
-    /// The command that continues.
-    fn command(&self) -> String {
-        format!("sudo pinion add {}", self.device.name)
+    report.set("changes", Value::Array(all));
+    if !edits.is_empty() {
+        report.line("");
     }
-
-    fn node(&self) -> &str {
-        &self.spot.node
+    if args.dry_run || edits.is_empty() {
+        return Ok(());
     }
-
-    fn draw(&mut self, wires: &[Wire]) -> Result<(), String> {
-        let (board, device) = (self.board, self.device);
-        let entry = |wire: &Wire| {
-            let label = board.pins.get(wire.pin - 1);
-            json!({ "device": wire.chip, "pin": wire.pin, "label": label, "line": board.line(wire.pin) })
-        };
-        self.report.set("wires", wires.iter().map(entry).collect());
-        self.report.set("trap", json!(device.trap));
-        self.report.line(format_args!("{} on {}, by {}", device.title, board.name, self.way.bus.name()));
-        self.report.line("");
-        self.report.page.append(&picture::page(board, wires));
-        self.report.line("");
-        self.report.line(format_args!("  level: {}", board.level));
-        self.report.line(format_args!("  mind:  {}", device.trap));
-        self.report.line("");
-        if let Some(path) = &self.args.picture {
-            let svg = picture::svg(board, &device.title, wires);
-            Output::check(path, &[])?.write(|out| io::Write::write_all(out, svg.as_bytes()))?;
-        }
-        self.report.show()
+    if side.computer.is_this() && side.is_root_s() && !geteuid().is_root() {
+        return Err(format!("these files are root's: {}", command(args, args.undo)));
     }
-
-    /// Writes the sections, and has the host read them. `boot` are the keys of what the device needs of the boot loader.
-    fn configure(
-        &mut self,
-        printer: &Printer,
-        wires: &[Wire],
-        address: Option<u8>,
-        boot: Vec<String>,
-    ) -> Result<(), String> {
-        let side = host(self.computer, printer);
-        let link = printer.link();
-        if self.computer.is_this() && !self.args.dry_run && !link.exists() {
-            // Without its MCU, klippy would not start with the new sections.
-            let link = link.display();
-            return Err(format!(
-                "Pinion does not serve at {link}: sudo systemctl enable --now pinion-mcu, then \"{}\"",
-                self.command()
-            ));
-        }
-        let is_own = printer.elsewhere(self.device).is_none();
-        if let Some(file) = printer.elsewhere(self.device) {
-            self.report.line(format_args!(
-                "[{}] is in {} already, and stays as it is.",
-                self.device.section,
-                file.display()
-            ));
-        }
-        let mut is_changed = false;
-        if is_own {
-            let sections = self.sections(printer, wires, address)?;
-            let (changes, mut needs) = printer.plan(&side, self.device, &sections)?;
-            // Recorded here, where no root is needed: another device may have made these changes.
-            needs.extend(boot);
-            let record = Record { changes, needs };
-            is_changed = !record.changes.is_empty();
-            if is_changed {
-                self.make(&side, &record, "Write this?")?;
-            }
-        }
-        if self.args.dry_run {
-            self.report.line("Nothing was changed (--dry-run).");
-            return Ok(());
-        }
-        if !is_changed {
-            self.report.line("Nothing is left to change.");
-        }
-        if self.computer.is_this() || self.args.moonraker != MOONRAKER {
-            let undo = format!("{} --undo takes it back", self.command());
-            self.measure(is_changed).map_err(|why| if is_own { format!("{why}: {undo}") } else { why })?;
-        }
-        self.report.set("next", json!(self.device.next));
-        self.report.line("Next:");
-        self.device.next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
-        self.report.line(format_args!("pinion add --undo {} takes all of it back.", word(self.device.name)));
-        Ok(())
+    if !question.is_empty() {
+        ask(args, side.computer, moonraker, report, question)?;
     }
-
-    /// The sections of printer.cfg.
-    fn sections(&self, printer: &Printer, wires: &[Wire], address: Option<u8>) -> Result<String, String> {
-        let (mcu, _) = printer.mcu();
-        let node = self.node();
-        let mut text = self.way.config.replace("{mcu}", &mcu);
-        let address = address.or_else(|| self.way.addresses.first().copied()).unwrap_or_default();
-        let values = [
-            ("spi_bus", node.to_owned()),
-            ("i2c_bus", node.replacen('-', ".", 1)),
-            ("pwm", node.to_owned()),
-            ("uart", node.to_owned()),
-            ("address", address.to_string()),
-        ];
-        for (name, value) in values {
-            text = text.replace(&format!("{{{name}}}"), &value);
-        }
-        for wire in wires.iter().filter(|wire| wire.role.starts_with("line")) {
-            let line = self.board.line(wire.pin).unwrap_or_default();
-            text = text.replace(&format!("{{{}}}", wire.role), line);
-        }
-        if text.contains("{serial_no}") {
-            let serial = self.thermometer(Some(printer)).ok_or(
-                "the thermometer's number is not known before it answers: boot the board with it, then call this again",
-            )?;
-            text = text.replace("{serial_no}", &serial);
-        }
-        Ok(text)
+    for told in side.make(edits)? {
+        report.line(told);
     }
-
-    /// Shows changes, asks, and makes them.
-    fn make(&mut self, side: &Side, record: &Record, question: &str) -> Result<(), String> {
-        let entry =
-            |change: &Change| json!({ "file": change.file, "old": change.splice.old, "new": change.splice.new });
-        let mut all = self.report.values.get("changes").and_then(Value::as_array).cloned().unwrap_or_default();
-        all.extend(record.changes.iter().map(entry));
-        self.report.set("changes", Value::Array(all));
-        let mut last = None;
-        for change in &record.changes {
-            if last != Some(&change.file) {
-                let how = if change.makes { "new file " } else { "" };
-                self.report.line(format_args!("{how}{}", change.file.display()));
-                last = Some(&change.file);
-            }
-            let lines = |text: &str| text.trim_matches(['\r', '\n']).lines().map(str::to_owned).collect::<Vec<_>>();
-            if !change.splice.old.is_empty() {
-                lines(&change.splice.old).iter().for_each(|line| self.report.line(format_args!("- {line}")));
-            }
-            lines(&change.splice.new).iter().for_each(|line| self.report.line(format_args!("+ {line}")));
-        }
-        self.report.line("");
-        if self.args.dry_run {
-            return Ok(());
-        }
-        if self.computer.is_this() && side.owner.is_none() && !geteuid().is_root() {
-            return Err(format!("these files are root's: {}", self.command()));
-        }
-        ask(self.args, self.computer, self.report, question)?;
-        side.make(self.device.name, record)?;
-        for file in
-            record.changes.iter().filter(|change| !change.makes).map(|change| &change.file).collect::<BTreeSet<_>>()
-        {
-            let copy = copy_of(file, self.device.name);
-            self.report.line(format_args!("{} is a copy of what was there.", copy.display()));
-        }
-        Ok(())
-    }
+    report.changed.extend(edits.iter().map(|edit| edit.file.display().to_string()));
+    Ok(())
 }

@@ -146,8 +146,11 @@ impl Moonraker<'_> {
     }
 
     fn exchange(&self, method: &str, path: &str) -> io::Result<(u16, Vec<u8>)> {
-        let address = self.0.to_socket_addrs()?.next().ok_or(io::ErrorKind::AddrNotAvailable)?;
-        let mut stream = TcpStream::connect_timeout(&address, CONNECT_TIMEOUT)?;
+        // A name may have an address of IPv6 first, where Moonraker does not listen.
+        let connect = |found: io::Result<TcpStream>, address| {
+            found.or_else(|_| TcpStream::connect_timeout(&address, CONNECT_TIMEOUT))
+        };
+        let mut stream = self.0.to_socket_addrs()?.fold(Err(io::ErrorKind::AddrNotAvailable.into()), connect)?;
         stream.set_write_timeout(Some(ANSWER_TIMEOUT))?;
         write!(stream, "{method} {path} HTTP/1.0\r\nHost: {}\r\nContent-Length: 0\r\n\r\n", self.0)?;
         let end = Instant::now() + ANSWER_TIMEOUT;

@@ -4,22 +4,27 @@
 use crate::cli::page::{Page, aligned};
 use pinion_linux::foreign::plain_xml;
 
-use super::board::{KnownBoard, Wire};
+use super::place::Wire;
+use crate::cli::computer::board::Board;
 
 /// A table of the wires, and the header with them.
-pub(super) fn page(board: &KnownBoard, wires: &[Wire]) -> Page {
+pub(super) fn page(board: &Board, wires: &[Wire]) -> Page {
     let mut page = Page::default();
     let place = |pin: usize| match &board.connector {
         None => format!("pin {pin}"),
         Some(_) => String::new(),
     };
     let mut rows = vec![vec!["wire".to_owned(), "to".to_owned(), String::new()]];
-    rows.extend(wires.iter().map(|wire| {
-        let label = board.pins.get(wire.pin - 1).cloned().unwrap_or_default();
-        vec![wire.chip.clone(), place(wire.pin), label]
-    }));
+    rows.extend(wires.iter().map(|wire| vec![wire.chip.clone(), place(wire.pin), board.label(wire.pin).to_owned()]));
     aligned(&rows).iter().for_each(|line| page.line(format_args!("  {line}")));
     page.line("");
+    page.append(&header(board, wires));
+    page
+}
+
+/// The header, with a name beside each of these pins.
+pub(in crate::cli) fn header(board: &Board, wires: &[Wire]) -> Page {
+    let mut page = Page::default();
     let wired = |pin: usize| wires.iter().find(|wire| wire.pin == pin).map(|wire| wire.chip.as_str());
     if let Some(connector) = &board.connector {
         page.line(format_args!("  {connector}"));
@@ -48,8 +53,8 @@ pub(super) fn page(board: &KnownBoard, wires: &[Wire]) -> Page {
     page
 }
 
-/// The same as a picture.
-pub(super) fn svg(board: &KnownBoard, title: &str, wires: &[Wire]) -> String {
+/// The header as a picture.
+pub(in crate::cli) fn svg(board: &Board, title: &str, wires: &[Wire]) -> String {
     const ROW: usize = 22;
     const TOP: usize = 56;
     let columns = if board.connector.is_some() { 1 } else { 2 };
@@ -107,28 +112,37 @@ pub(super) fn svg(board: &KnownBoard, title: &str, wires: &[Wire]) -> String {
 mod tests {
     use super::*;
     use crate::cli::add::catalog::Catalog;
+    use crate::cli::add::place::Search;
     use crate::cli::computer::tests::Tree;
-    use std::collections::BTreeSet;
+    use crate::cli::computer::uses::Uses;
+    use std::collections::BTreeMap;
+
+    fn adxl345(tree: &Tree) -> (Board, Vec<Wire>) {
+        let catalog = Catalog::read().unwrap();
+        let computer = tree.computer();
+        let board = Board::of(&computer, None).unwrap().unwrap();
+        let uses = Uses::find(&computer, Some(&board), None, None);
+        let search = Search { board: &board, uses: &uses, own: None, there: None };
+        let device = catalog.device("adxl345").unwrap();
+        let way = &device.way[0];
+        let wires = search.wires(device, way, &search.spots(way)[0], &BTreeMap::new(), None).unwrap();
+        (board, wires)
+    }
 
     #[test]
     fn each_wire_is_drawn_at_its_pin() {
-        let catalog = Catalog::read().unwrap();
-        for model in ["Raspberry Pi 4", "BigTreeTech CB1", "OrangePi Zero3"] {
+        for model in ["Raspberry Pi 4 Model B", "BigTreeTech CB1", "OrangePi Zero3"] {
             let tree = Tree::new();
             tree.put("proc/device-tree/model", model);
-            let board = catalog.board(&tree.computer()).unwrap();
-            let way = &catalog.device("adxl345").unwrap().way[0];
-            let wires = board
-                .wires(way, &board.spot(way, &|_, _| None, &BTreeSet::new()).unwrap(), &BTreeSet::new(), None)
-                .unwrap();
-            let text = page(board, &wires).to_string();
+            let (board, wires) = adxl345(&tree);
+            let text = page(&board, &wires).to_string();
             let rows: Vec<&str> = text.lines().skip_while(|line| !line.is_empty()).skip(1).collect();
             assert_eq!(rows.len(), board.pins.len() / 2, "{text}");
             assert!(rows[0].starts_with("  VCC or 3V3 --") && rows[0].contains(" 1 * o 2 "), "{text}");
             assert_eq!(text.matches(" --").count(), wires.len(), "{text}");
             let pin_19 = rows[9];
             assert!(pin_19.contains("SDA --") && pin_19.contains("19 *"), "{text}");
-            let svg = svg(board, "<ADXL345>", &wires);
+            let svg = svg(&board, "<ADXL345>", &wires);
             let document = roxmltree::Document::parse(&svg).unwrap();
             assert_eq!(document.descendants().filter(|node| node.has_tag_name("path")).count(), wires.len());
             assert!(svg.contains("&lt;ADXL345&gt;"));
@@ -137,17 +151,12 @@ mod tests {
 
     #[test]
     fn a_connector_has_names_instead_of_numbers() {
-        let catalog = Catalog::read().unwrap();
         let tree = Tree::new();
         tree.put("proc/device-tree/model", "BigTreeTech CB1\0");
         tree.put("boot/system.cfg", "BTT_PAD7=\"ON\"\n");
-        let board = catalog.board(&tree.computer()).unwrap();
-        let way = &catalog.device("adxl345").unwrap().way[0];
-        let wires = board
-            .wires(way, &board.spot(way, &|_, _| None, &BTreeSet::new()).unwrap(), &BTreeSet::new(), None)
-            .unwrap();
-        let text = page(board, &wires).to_string();
+        let (board, wires) = adxl345(&tree);
+        let text = page(&board, &wires).to_string();
         assert!(text.contains("the connector SPI") && !text.contains("pin "), "{text}");
-        assert!(!svg(board, "x", &wires).contains(">1<"));
+        assert!(!svg(&board, "x", &wires).contains(">1<"));
     }
 }

@@ -1,81 +1,52 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! printer.cfg: its sections, and the ones that a device adds.
+//! The printer.cfg to which a device is added, and the files that pinion add has beside it.
 //!
 //! A device has a file of its own in the folder `pinion` beside printer.cfg, and all of them share one
-//! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched.
+//! `[include pinion/*.cfg]`. Nothing else in printer.cfg is touched. The head of each file says that pinion add has written
+//! it, with a checksum of the rest: so a file that the user has changed is known.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::io;
+use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use glob::Pattern;
-use pinion_printer_config::{Config, Files, Limit, Section, Setting, included};
+use pinion_printer_config::{Config, Limit, Section, included};
 
 use crate::cli::computer::Computer;
-use crate::cli::doctor::host::klippys;
-use crate::cli::doctor::printer::{mcu_of, name_of, pins};
+use crate::cli::computer::klippy::{Klippy, klippys};
+use crate::cli::computer::printer::{LINK, Printer, configs};
+use crate::cli::computer::uses::Use;
 use pinion_linux::foreign::word;
-use pinion_runtime::klippy::HOST_PATHS;
 
-use super::catalog::{Device, Kind};
-use super::change::{Change, Side};
-use super::splice::Splice;
+use super::catalog::{Catalog, Device, Way};
+use super::side::{Edit, MARK, Side};
 
-/// Where klippy's configuration is if no klippy runs or is set up.
-const USUAL: [&str; 3] =
-    ["/home/*/printer_data/config/printer.cfg", "/home/*/klipper_config/printer.cfg", "/home/*/printer.cfg"];
-/// The usual link to this computer's MCU.
-const LINK: &str = "/tmp/klipper_host_mcu";
-/// The key of the change that includes the folder.
-const INCLUDE: &str = "include";
-/// The key of the change that adds the MCU.
-const MCU: &str = "mcu";
 /// How high above the bed resonances are measured, in millimeters (docs/Measuring_Resonances.md of Klipper).
 const PROBE_Z_MM: f64 = 20.0;
+/// The file of this computer's MCU, without `.cfg`.
+pub(super) const MCU: &str = "host-mcu";
+/// The file of `[resonance_tester]`.
+pub(super) const RESONANCES: &str = "resonance_tester";
+/// Where Moonraker answers, if nothing says otherwise.
+const MOONRAKER_PORT: &str = "7125";
 
 /// klippy's configuration.
-#[derive(Debug)]
-pub(super) struct Printer {
+pub(super) struct Target {
     /// printer.cfg as klippy names it, as a path of the computer. klippy looks for includes in its folder.
-    path: PathBuf,
+    pub(super) path: PathBuf,
     /// The file itself: klippy may name it by a link.
     file: PathBuf,
     /// Its owner and group.
     pub(super) owner: (u32, u32),
     /// The contents of printer.cfg itself.
     text: String,
-    config: Config,
-}
-
-/// The files of a configuration, as far as they can be read: another user's do not count.
-struct Readable<'a> {
-    computer: &'a Computer,
-    /// printer.cfg and its contents.
-    main: (&'a Path, &'a str),
-}
-
-impl Files for Readable<'_> {
-    fn text(&self, path: &Path) -> io::Result<String> {
-        let (main, text) = self.main;
-        Ok(if path == main { text.to_owned() } else { Files::text(self.computer, path).unwrap_or_default() })
-    }
-
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        Ok(self.computer.matching(pattern).iter().map(|file| self.computer.name(file)).collect())
-    }
-
-    fn whole(&self, path: &Path) -> PathBuf {
-        self.computer.whole(path)
-    }
+    printer: Printer,
+    /// The MCUs of this computer, with their links.
+    mcus: BTreeMap<String, PathBuf>,
 }
 
 /// Finds printer.cfg: the named one, the one of the only klippy, or the only one in a home folder.
-///
-/// # Errors
-///
-/// One line: there is none, or there are several.
-pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf, String> {
+fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf, String> {
     if let Some(named) = named {
         let absolute = if computer.is_this() { std::path::absolute(named) } else { Ok(Path::new("/").join(named)) };
         return absolute.map_err(|error| format!("{}: {error}", named.display()));
@@ -92,20 +63,9 @@ pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<PathBuf,
     }
 }
 
-/// The configurations of the computer's klippys, or those in the usual places.
-fn configs(computer: &Computer) -> BTreeSet<PathBuf> {
-    let of_klippys: BTreeSet<PathBuf> = klippys(computer).into_iter().filter_map(|klippy| klippy.config).collect();
-    if !of_klippys.is_empty() {
-        return of_klippys;
-    }
-    let usual = USUAL.iter().map(|pattern| computer.matching(pattern)).find(|found| !found.is_empty());
-    usual.unwrap_or_default().iter().map(|path| computer.name(path)).collect()
-}
-
 /// The file behind a path, as a path of the computer.
 fn behind(computer: &Computer, path: &Path) -> Option<PathBuf> {
-    let file = computer.follow(path).ok()?.pop()?;
-    Some(computer.name(&file.canonicalize().ok()?))
+    Some(computer.name(&computer.resolve(path).ok()?.canonicalize().ok()?))
 }
 
 /// The link by which klippy names this file.
@@ -116,75 +76,75 @@ fn link_to(computer: &Computer, file: &Path) -> Option<PathBuf> {
     configs(computer).into_iter().find(is_it)
 }
 
-/// Whether a section uses this node of a bus.
-fn uses(section: &Section, kind: Kind, node: &str) -> bool {
-    let name = node.replacen("i2c-", "i2c.", 1);
-    section.settings().iter().any(|setting| {
-        let value = name_of(&setting.value);
-        // The driver of an ADC takes the first chip select.
-        kind == Kind::W1 && setting.key == "serial_no"
-            || value == name
-            || value.strip_prefix(name.as_str()).is_some_and(|rest| rest.starts_with('/'))
-            || node == "spidev0.0" && value.starts_with("mcp3208/")
-    })
+/// A file of pinion add.
+pub(super) fn written(name: &str, title: &str, rest: &str) -> String {
+    format!("# Written by {MARK} {name} ({:08x}): {title}\n{rest}", checksum(rest))
 }
 
-impl Printer {
-    /// Finds printer.cfg as [`find`] does, and reads it. klippy may name a file by a link.
+/// Whether pinion add has written a file, and whether it is still as it was written.
+pub(super) fn is_ours(text: &str) -> Option<bool> {
+    let (head, rest) = text.split_once('\n')?;
+    let sum = head.strip_prefix("# Written by ")?.strip_prefix(MARK)?.split_once('(')?.1.split_once(')')?.0;
+    Some(sum == format!("{:08x}", checksum(rest)))
+}
+
+/// FNV-1a: it only has to notice an editor.
+fn checksum(text: &str) -> u32 {
+    text.bytes().fold(0x811c_9dc5, |sum, byte| (sum ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+}
+
+impl Target {
+    /// Finds printer.cfg, and reads it with the files that it includes, with its owner's rights.
     ///
     /// # Errors
     ///
-    /// One line: there is none, there are several, or it cannot be read.
-    pub(super) fn find(computer: &Computer, named: Option<&Path>) -> Result<Printer, String> {
+    /// One line: there is none, there are several, it cannot be read, is a link, or has a line that klippy refuses.
+    pub(super) fn find(computer: &Computer, named: Option<&Path>, mcu: Option<&str>) -> Result<Target, String> {
         let file = find(computer, named)?;
-        let link = named.and_then(|_| link_to(computer, &file));
-        Printer::read_as(computer, &file, link.as_deref().unwrap_or(&file))
-    }
-
-    /// Reads the file that klippy names so, with the files that it includes. A file that cannot be read, such as another
-    /// user's, does not count.
-    ///
-    /// # Errors
-    ///
-    /// One line: printer.cfg itself cannot be read, is a link, or has a line that klippy refuses.
-    pub(super) fn read(computer: &Computer, path: &Path) -> Result<Printer, String> {
-        Printer::read_as(computer, path, path)
-    }
-
-    fn read_as(computer: &Computer, path: &Path, named: &Path) -> Result<Printer, String> {
-        let about = std::fs::symlink_metadata(computer.path(path));
-        let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", path.display()))?;
+        let path = named.and_then(|_| link_to(computer, &file)).unwrap_or_else(|| file.clone());
+        let folder = computer.resolve(file.parent().unwrap_or(Path::new("/"))).map_err(|error| error.to_string())?;
+        let about = std::fs::symlink_metadata(folder.join(file.file_name().unwrap_or_default()));
+        let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", file.display()))?;
         if about.is_symlink() {
-            let file = behind(computer, path).map_or("FILE".into(), |file| word(file.display()));
-            return Err(format!("{}: it is a link: name the file that it leads to: --config {file}", path.display()));
+            let target = behind(computer, &file).map_or("FILE".into(), |file| word(file.display()));
+            return Err(format!("{}: it is a link: name the file that it leads to: --config {target}", file.display()));
         }
         let owner = (about.uid(), about.gid());
-        let side = Side { computer, owner: Some(owner), records: PathBuf::new() };
-        let text = side.read(path)?.unwrap_or_default();
-        let config = Config::read_from(&Readable { computer, main: (named, &text) }, named);
-        let config = config.map_err(|trouble| trouble.to_string())?;
-        Ok(Printer { path: named.to_owned(), file: path.to_owned(), owner, text, config })
+        let side = Side::new(computer, Some(owner));
+        let text = side.read(&file)?.unwrap_or_default();
+        let _rights = side.rights().map_err(|error| error.to_string())?;
+        let printer = Printer::read(computer, &path).map_err(|trouble| trouble.to_string())?;
+        let mcus = printer.own_mcus(computer, mcu);
+        Ok(Target { path, file, owner, text, printer, mcus })
     }
 
-    /// The sections with a bus or a sensor of this computer that is not there, with its file.
-    pub(super) fn absent(&self, computer: &Computer) -> Vec<(&str, Option<&str>, String)> {
-        let file = |setting: &Setting| {
-            let name = name_of(&setting.value);
-            let is_number = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_digit() || c == '.');
-            match (setting.key.as_str(), name.strip_prefix("spidev"), name.strip_prefix("i2c.")) {
-                ("spi_bus" | "pin", Some(number), _) if is_number(number) => Some(format!("/dev/{name}")),
-                ("i2c_bus", _, Some(number)) if is_number(number) => Some(format!("/dev/i2c-{number}")),
-                ("serial_no", ..) if name.chars().all(|c| c.is_ascii_hexdigit() || c == '-') => {
-                    Some(format!("/sys/bus/w1/devices/{name}"))
-                }
-                _ => None,
-            }
+    /// Its Moonraker's address. Without a moonraker.conf beside it, the usual one, if this is the only host.
+    ///
+    /// # Errors
+    ///
+    /// One line: it is not known which Moonraker is this host's.
+    pub(super) fn moonraker(&self, computer: &Computer) -> Result<String, String> {
+        let Ok(config) = Config::read_from(computer, &self.path.with_file_name("moonraker.conf")) else {
+            return match configs(computer).len() {
+                0 | 1 => Ok(format!("127.0.0.1:{MOONRAKER_PORT}")),
+                _ => Err("there are several hosts: name the Moonraker of this one with --moonraker ADDRESS".into()),
+            };
         };
-        let absent = self.config.sections().iter().filter_map(|section| {
-            let file = section.settings().iter().find_map(file).filter(|file| !computer.path(file).exists())?;
-            Some((section.name.as_str(), section.text("sensor_type"), file))
-        });
-        absent.collect()
+        let value = |key: &str| config.section("server").and_then(|section| section.text(key));
+        let host = value("host").filter(|host| !["0.0.0.0", "::", "all"].contains(host)).unwrap_or("127.0.0.1");
+        let host = if host.contains(':') { format!("[{host}]") } else { host.to_owned() };
+        Ok(format!("{host}:{}", value("port").unwrap_or(MOONRAKER_PORT)))
+    }
+
+    /// Its klippy.
+    pub(super) fn klippy(&self, computer: &Computer) -> Option<Klippy> {
+        let mut all = klippys(computer);
+        let at = all.iter().position(|klippy| klippy.config.as_ref() == Some(&self.path));
+        match (at, all.len()) {
+            (Some(at), _) => Some(all.swap_remove(at)),
+            (None, 1) => all.pop(),
+            _ => None,
+        }
     }
 
     /// The folder of the devices' files.
@@ -192,124 +152,150 @@ impl Printer {
         self.path.parent().unwrap_or(Path::new("/")).join("pinion")
     }
 
-    /// The file of a device.
-    pub(super) fn file(&self, device: &str) -> PathBuf {
-        self.folder().join(format!("{device}.cfg"))
+    /// A file in that folder, named without `.cfg`.
+    pub(super) fn file(&self, name: &str) -> PathBuf {
+        self.folder().join(format!("{name}.cfg"))
     }
 
-    /// A file other than the device's own that has this section.
-    pub(super) fn elsewhere(&self, device: &Device) -> Option<&Path> {
-        let own = self.file(device.name);
-        self.config.files_of(&device.section).find(|file| *file != own)
+    pub(super) fn config(&self) -> &Config {
+        &self.printer.config
     }
 
-    /// The sections that are not in the device's own file.
-    fn others(&self, device: &Device) -> impl Iterator<Item = &Section> {
-        let own = self.file(device.name);
-        let is_own = move |section: &Section| self.config.files_of(&section.name).any(|file| file == own);
-        self.config.sections().iter().filter(move |section| !is_own(section))
+    /// Whether a file has a line of a section.
+    pub(super) fn is_in(&self, section: &Section, file: &Path) -> bool {
+        self.config().files_of(&section.name).any(|own| own == file)
     }
 
-    /// The pins of this computer that printer.cfg uses, without those of the device's own file.
-    pub(super) fn taken(&self, device: &Device) -> BTreeSet<String> {
-        let mcus = self.mcus();
-        // Another MCU may have pins of the same names.
-        let is_own = |pin: &&str| mcu_of(pin).is_some_and(|mcu| mcus.contains_key(mcu.as_str()));
-        self.others(device).flat_map(pins).filter(is_own).map(|pin| name_of(pin).to_owned()).collect()
+    /// The sections that are not in this file.
+    pub(super) fn others<'a>(&'a self, own: &'a Path) -> impl Iterator<Item = &'a Section> {
+        self.config().sections().iter().filter(|section| !self.is_in(section, own))
     }
 
-    /// The section other than the device's own that uses this node of a bus.
-    pub(super) fn user(&self, device: &Device, kind: Kind, node: &str) -> Option<String> {
-        self.others(device).find(|section| uses(section, kind, node)).map(|section| section.name.clone())
+    /// The MCU of a section: that of its pins, or its `i2c_mcu`.
+    pub(super) fn mcu_of(&self, section: &Section) -> String {
+        let named = ["i2c_mcu", "sensor_mcu"].iter().find_map(|key| section.text(key)).map(str::to_owned);
+        named
+            .or_else(|| self.printer.pins_of(section).map(|named| named.pin.chip).next())
+            .unwrap_or_else(|| "mcu".into())
     }
 
-    /// Whether the device's own file, which an earlier call has written, uses this node of a bus.
-    pub(super) fn has_placed(&self, device: &Device, kind: Kind, node: &str) -> bool {
-        let own = self.file(device.name);
-        let mut sections = self.config.sections().iter();
-        sections.any(|section| self.config.files_of(&section.name).any(|file| file == own) && uses(section, kind, node))
+    /// Whether a section is on an MCU of this computer. 1-Wire is always.
+    pub(super) fn is_here(&self, section: &Section) -> bool {
+        section.text("serial_no").is_some() || self.mcus.contains_key(&self.mcu_of(section))
     }
 
-    /// The serial numbers that thermometers of printer.cfg have, without the device's own.
-    pub(super) fn serials(&self, device: &Device) -> BTreeSet<&str> {
-        self.others(device).filter_map(|section| section.text("serial_no")).collect()
+    /// The MCU of this computer, with its link, and whether it has to be added.
+    ///
+    /// # Errors
+    ///
+    /// One line: there are several, and none has the usual link.
+    pub(super) fn mcu(&self, wanted: Option<&str>) -> Result<(String, PathBuf, bool), String> {
+        let names = || self.mcus.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
+        if let Some(wanted) = wanted {
+            let link = self.mcus.get(wanted);
+            let link = link.ok_or_else(|| {
+                format!("--mcu: \"{wanted}\" is not an MCU of this computer: printer.cfg has {}", names())
+            })?;
+            return Ok((wanted.to_owned(), link.clone(), false));
+        }
+        let usual = self.mcus.iter().find(|(_, link)| *link == Path::new(LINK));
+        match (usual, self.mcus.len()) {
+            (Some((name, link)), _) => Ok((name.clone(), link.clone(), false)),
+            (None, 0) => {
+                let is_free = |name: &String| self.config().section(&format!("mcu {name}")).is_none();
+                let mut more = (2..).map(|number| format!("host{number}"));
+                let name = Some("host".to_owned()).filter(is_free).or_else(|| more.find(is_free)).unwrap_or_default();
+                Ok((name, LINK.into(), true))
+            }
+            (None, 1) => {
+                Ok(self.mcus.iter().next().map(|(name, link)| (name.clone(), link.clone(), false)).unwrap_or_default())
+            }
+            _ => Err(format!("this computer has several MCUs in printer.cfg: choose one with --mcu NAME: {}", names())),
+        }
     }
 
-    /// The MCUs of this computer, with their sections. The main one is called `mcu`.
-    fn mcus(&self) -> BTreeMap<&str, &Section> {
-        let own = self.config.of_kind("mcu").filter_map(|section| {
-            section.text("serial").filter(|serial| serial.starts_with(HOST_PATHS))?;
-            Some((section.name.strip_prefix("mcu ").map_or("mcu", str::trim), section))
-        });
-        own.collect()
-    }
-
-    /// The name of this computer's MCU, and whether it has to be added.
-    pub(super) fn mcu(&self) -> (String, bool) {
-        self.mcus().keys().next().map_or(("host".into(), true), |name| ((*name).to_owned(), false))
-    }
-
-    /// The link by which klippy finds this computer's MCU.
-    pub(super) fn link(&self) -> &Path {
-        let serial = self.mcus().values().find_map(|section| section.text("serial"));
-        serial.map_or(Path::new(LINK), Path::new)
+    /// The values of a device's file that an earlier call has written, by the roles in its template.
+    pub(super) fn written_pins(&self, device: &Device, way: &Way, name: Option<&str>) -> BTreeMap<String, String> {
+        let own = self.file(&device.file(name));
+        let template = device.named(&way.config, name);
+        let mut section: Option<&Section> = None;
+        let mut found = BTreeMap::new();
+        for line in template.lines() {
+            if let Some(name) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
+                section = self.config().section(name).filter(|section| self.is_in(section, &own));
+            }
+            let Some((key, value)) = line.split_once(": ") else { continue };
+            let role = value.rsplit_once('{').and_then(|(_, rest)| rest.strip_suffix('}'));
+            if let (Some(role), Some(section)) = (role, section)
+                && let Some(pin) = self
+                    .printer
+                    .pins_of(section)
+                    .find(|named| section.text(key).is_some_and(|text| text.trim() == named.text))
+            {
+                found.insert(role.to_owned(), pin.pin.name);
+            }
+        }
+        found
     }
 
     /// The middle of the bed.
     fn probe_point(&self) -> Option<String> {
-        let number = |section: &str, key: &str| self.config.section(section)?.number(key, Limit::Any).ok()?;
+        let number = |section: &str, key: &str| self.config().section(section)?.number(key, Limit::Any).ok()?;
         let middle = |axis: &str| {
             let section = format!("stepper_{axis}");
             let (from, to) = (number(&section, "position_min").unwrap_or(0.0), number(&section, "position_max")?);
             // A negative minimum is beside the bed.
             Some((from.max(0.0) + to) / 2.0)
         };
-        if self.config.section("stepper_a").is_some() {
+        if self.config().section("stepper_a").is_some() {
             // The middle of a delta printer is its origin.
             return Some(format!("0, 0, {PROBE_Z_MM}"));
         }
         Some(format!("{:.0}, {:.0}, {PROBE_Z_MM}", middle("x")?, middle("y")?))
     }
 
-    /// The changes that add these sections for a device, and the keys of all that it needs.
+    /// The file with `[resonance_tester]` for this accelerometer.
+    fn resonances(&self, section: &str) -> String {
+        let rest = match self.probe_point() {
+            Some(point) => format!(
+                "[resonance_tester]\naccel_chip: {section}\n# The middle of the bed, and {PROBE_Z_MM} mm above it\nprobe_points: {point}\n"
+            ),
+            None => "# [resonance_tester] needs your probe point: see docs/Measuring_Resonances.md of Klipper\n".into(),
+        };
+        written(RESONANCES, "resonances", &rest)
+    }
+
+    /// The changes that add these sections for a device.
     ///
     /// # Errors
     ///
-    /// One line: a file in the way is not ours.
+    /// One line: a file in the way cannot be read.
     pub(super) fn plan(
         &self,
         side: &Side,
         device: &Device,
+        name: Option<&str>,
         sections: &str,
-    ) -> Result<(Vec<Change>, Vec<String>), String> {
-        let mut changes = Vec::new();
-        let mut needs = vec![INCLUDE.to_owned()];
-        let mut make = |key: &str, file: PathBuf, text: String| -> Result<(), String> {
+        mcu: Option<&str>,
+    ) -> Result<Vec<Edit>, String> {
+        let mut edits = Vec::new();
+        let mut make = |name: &str, text: String| -> Result<(), String> {
+            let file = self.file(name);
             // A file that is there is left as it is: the user may have changed it.
             if side.read(&file)?.is_none() {
-                changes.push(Change { key: key.to_owned(), file, makes: true, splice: Splice::insert(0, text) });
+                edits.push(Edit { file, old: None, new: Some(text) });
             }
             Ok(())
         };
-        let (mcu, is_missing) = self.mcu();
-        if is_missing {
-            let text =
-                format!("# Written by pinion add. This computer's pins and buses.\n[mcu {mcu}]\nserial: {LINK}\n");
-            make(MCU, self.file("host-mcu"), text)?;
+        if let Some(mcu) = mcu {
+            let text = format!("[mcu {mcu}]\nserial: {LINK}\n");
+            make(MCU, written(MCU, "this computer's pins and buses", &text))?;
         }
-        needs.push(MCU.to_owned());
-        let mut text = format!("# Written by pinion add {}. {}\n{}", device.name, device.title, sections.trim_start());
-        if device.resonance && !self.others(device).any(|section| section.name == "resonance_tester") {
-            text += &match self.probe_point() {
-                Some(point) => format!(
-                    "\n[resonance_tester]\naccel_chip: {}\n# The middle of the bed, and {PROBE_Z_MM} mm above it\nprobe_points: {point}\n",
-                    device.section
-                ),
-                None => "\n# [resonance_tester] needs your probe point: see docs/Measuring_Resonances.md of Klipper\n"
-                    .into(),
-            };
+        let own = device.file(name);
+        make(&own, written(&own, &device.title, sections.trim_start()))?;
+        if device.resonance && self.config().section(RESONANCES).is_none() {
+            make(RESONANCES, self.resonances(&device.section(name)))?;
         }
-        make(device.name, self.file(device.name), text)?;
         let folder = self.folder();
         let includes = self.text.lines().filter_map(included);
         let is_included = includes.map(|pattern| self.path.with_file_name(pattern)).any(|pattern| {
@@ -317,14 +303,14 @@ impl Printer {
             pattern.is_some_and(|pattern| pattern.matches_path(&folder.join("any-name.cfg")))
         });
         if !is_included {
-            changes.push(Change { key: INCLUDE.into(), file: self.file.clone(), makes: false, splice: self.include() });
+            edits.push(Edit { file: self.file.clone(), old: Some(self.text.clone()), new: Some(self.with_include()) });
         }
-        Ok((changes, needs))
+        Ok(edits)
     }
 
-    /// The include, behind the last one at the top of printer.cfg, or at its head. No option can stand behind an
-    /// include, so it never comes between a section and its options.
-    fn include(&self) -> Splice {
+    /// printer.cfg with the include, behind the last one at the top, or at its head. No option can stand behind an include,
+    /// so it never comes between a section and its options.
+    fn with_include(&self) -> String {
         let end = if self.text.contains("\r\n") { "\r\n" } else { "\n" };
         let mut at = 0;
         let mut place = 0;
@@ -334,66 +320,216 @@ impl Printer {
                 place = at;
             }
         }
-        let is_open = !self.text[..place].is_empty() && !self.text[..place].ends_with('\n');
-        let before = if is_open { end } else { "" };
-        Splice::insert(place, format!("{before}[include pinion/*.cfg]{end}"))
+        let (before, after) = self.text.split_at(place);
+        let is_open = !before.is_empty() && !before.ends_with('\n');
+        format!("{before}{}{INCLUDE}{end}{after}", if is_open { end } else { "" })
     }
+
+    /// The changes that take a device out, and a line for each thing that stays.
+    ///
+    /// # Errors
+    ///
+    /// One line: a file cannot be read.
+    pub(super) fn plan_undo(
+        &self,
+        side: &Side,
+        catalog: &Catalog,
+        device: &Device,
+        name: Option<&str>,
+        left: &mut Vec<String>,
+    ) -> Result<Vec<Edit>, String> {
+        let mut edits = Vec::new();
+        let stem = device.file(name);
+        let file = self.file(&stem);
+        let gone = |file: &Path, text: &str| Edit { file: file.to_owned(), old: Some(text.to_owned()), new: None };
+        let text = side.read(&file)?;
+        match text.as_deref().map(|text| (text, is_ours(text))) {
+            Some((text, Some(is_unchanged))) => {
+                edits.push(gone(&file, text));
+                if !is_unchanged {
+                    // klippy does not read it under this name.
+                    let kept = file.with_extension("cfg.removed");
+                    let old = side.read(&kept)?;
+                    edits.push(Edit { file: kept.clone(), old, new: Some(text.to_owned()) });
+                    left.push(format!("{} was changed since: {} keeps it", file.display(), kept.display()));
+                }
+            }
+            Some((_, None)) => left.push(format!("{} is not a file of pinion add, and stays", file.display())),
+            None => {}
+        }
+        let mut stays: Vec<&Section> = self.others(&file).collect();
+        // Another accelerometer goes on measuring resonances.
+        let resonances = self.file(RESONANCES);
+        let shared = [self.file(MCU), resonances.clone(), file.clone()];
+        let others = side.computer.matching(self.folder().join("*.cfg"));
+        let others: Vec<PathBuf> =
+            others.iter().map(|path| side.computer.name(path)).filter(|path| !shared.contains(path)).collect();
+        if let Some(text) = side.read(&resonances)?.filter(|text| is_ours(text) == Some(true)) {
+            let chip = self.config().section(RESONANCES).and_then(|section| section.text("accel_chip"));
+            let is_other =
+                |section: &&&Section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section));
+            match stays.iter().find(is_other) {
+                // It is this other one's already.
+                Some(_) if chip.is_some_and(|chip| chip != device.section(name)) => {}
+                Some(other) => {
+                    let new = Some(self.resonances(&other.name)).filter(|new| *new != text);
+                    edits.extend(new.map(|new| Edit { file: resonances.clone(), old: Some(text), new: Some(new) }));
+                }
+                None => {
+                    edits.push(gone(&resonances, &text));
+                    stays.retain(|section| !self.is_in(section, &resonances));
+                }
+            }
+        }
+        let mcu_file = self.file(MCU);
+        if let Some(text) = side.read(&mcu_file)?.filter(|text| is_ours(text) == Some(true)) {
+            let own = self.config().of_kind("mcu").find(|section| self.is_in(section, &mcu_file));
+            let mcu = own.map_or("", |section| section.name.trim_start_matches("mcu ").trim());
+            let names_it = |section: &&&Section| {
+                let named = section.settings().iter().filter(|setting| setting.key.contains("mcu"));
+                let is_listed = named.flat_map(|setting| setting.value.split(',')).any(|own| own.trim() == mcu);
+                let is_pin = |text: &str| text.trim_start_matches(['^', '~', '!', ' ']).starts_with(&format!("{mcu}:"));
+                let has_pin =
+                    section.settings().iter().flat_map(|setting| setting.value.split([',', '\n'])).any(is_pin);
+                section.kind() != "mcu" && (is_listed || has_pin)
+            };
+            match stays.iter().find(names_it) {
+                Some(user) if !self.is_pinion_s(user) => {
+                    left.push(format!("{} stays: [{}] uses [mcu {mcu}]", mcu_file.display(), user.name));
+                }
+                Some(_) => {}
+                // Without its include, klippy does not read the others now.
+                None if own.is_some() || others.is_empty() => edits.push(gone(&mcu_file, &text)),
+                None => {}
+            }
+        }
+        let goes = |file: &Path| edits.iter().any(|edit| edit.file == file && edit.new.is_none());
+        let remaining = side.computer.matching(self.folder().join("*.cfg"));
+        let mut remaining = remaining.iter().map(|path| side.computer.name(path)).filter(|path| !goes(path));
+        // What klippy would still find of the device would be a section without its options.
+        let saved: Vec<&str> = self
+            .config()
+            .sections()
+            .iter()
+            .filter(|section| goes(&file) && self.is_in(section, &file))
+            .map(|section| section.name.as_str())
+            .collect();
+        let mut printer_cfg = self.config().without_saved(&self.text, &saved);
+        if printer_cfg != self.text {
+            left.push(format!(
+                "the lines of [{}] in the SAVE_CONFIG block of {} go, too",
+                saved.join("], ["),
+                self.file.display()
+            ));
+        }
+        if self.text.contains(INCLUDE) || self.text.contains("[include pinion/") {
+            let is_include = |line: &&str| line.trim_end() == INCLUDE;
+            match remaining.next() {
+                Some(other) => {
+                    if side.read(&other)?.is_none_or(|text| is_ours(&text).is_none()) {
+                        left.push(format!("{} keeps its include: {} is there", self.file.display(), other.display()));
+                    }
+                }
+                None if self.text.lines().any(|line| is_include(&line)) => {
+                    printer_cfg = printer_cfg.split_inclusive('\n').filter(|line| !is_include(line)).collect();
+                }
+                None if edits.is_empty() => {}
+                None => left
+                    .push(format!("{} keeps its include: pinion add has not written this line", self.file.display())),
+            }
+        }
+        match printer_cfg == self.text {
+            true => edits.extend(side.needless_copy(&self.file, &self.text)?),
+            false => edits.push(Edit { file: self.file.clone(), old: Some(self.text.clone()), new: Some(printer_cfg) }),
+        }
+        Ok(edits)
+    }
+
+    /// Whether a section is in a file of the folder `pinion`.
+    pub(super) fn is_pinion_s(&self, section: &Section) -> bool {
+        self.config().files_of(&section.name).any(|file| file.starts_with(self.folder()))
+    }
+
+    /// Whether a use is one of this file.
+    pub(super) fn is_use_of(one: &Use, file: &Path) -> bool {
+        one.place.rsplit_once(':').is_some_and(|(path, _)| Path::new(path) == file)
+    }
+
+    /// The files that pinion add may have left half-written.
+    pub(super) fn files(&self) -> impl Iterator<Item = PathBuf> {
+        [self.file.clone(), self.file(MCU), self.file(RESONANCES)].into_iter()
+    }
+}
+
+/// The line that includes the folder. A line of the user's own has no such comment.
+const INCLUDE: &str = "[include pinion/*.cfg] # by pinion add";
+
+/// Whether a folder of klippy lacks this module. `None` if it cannot be read.
+pub(super) fn lacks(klippy: &Klippy, module: &str) -> Option<PathBuf> {
+    let folder = klippy.folder.as_ref()?;
+    let extras = folder.join("extras");
+    let is_there = ["extras", "plugins"].iter().any(|place| {
+        let place = folder.join(place);
+        place.join(format!("{module}.py")).exists() || place.join(module).is_dir()
+    });
+    (extras.join("bus.py").exists() && !is_there).then(|| folder.clone())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::add::catalog::Catalog;
     use crate::cli::computer::tests::Tree;
 
     const CONFIG: &str = "/home/pi/printer_data/config/printer.cfg";
 
-    fn read(files: &[(&str, &str)]) -> (Tree, Printer) {
+    fn read(files: &[(&str, &str)]) -> (Tree, Target) {
         let tree = Tree::new();
         for (name, text) in files {
             tree.put(&format!("home/pi/printer_data/config/{name}"), text);
         }
-        let path = find(&tree.computer(), None).unwrap();
-        assert_eq!(path, Path::new(CONFIG));
-        let printer = Printer::read(&tree.computer(), &path).unwrap();
-        (tree, printer)
+        let target = Target::find(&tree.computer(), None, None).unwrap();
+        assert_eq!(target.path, Path::new(CONFIG));
+        (tree, target)
     }
 
-    fn plan(tree: &Tree, printer: &Printer, device: &str) -> Vec<(String, String)> {
+    /// The files that a device without sections of its own changes, with their new texts.
+    fn plan(tree: &Tree, target: &Target, device: &str) -> Vec<(String, String)> {
         let catalog = Catalog::read().unwrap();
         let device = catalog.device(device).unwrap();
         let computer = tree.computer();
-        let side = Side { computer: &computer, owner: None, records: printer.folder() };
-        let (changes, _) = printer.plan(&side, device, "[x]\n").unwrap();
-        let name =
-            |change: &Change| change.file.strip_prefix("/home/pi/printer_data/config").unwrap().display().to_string();
-        changes.iter().map(|change| (name(change), change.splice.new.clone())).collect()
+        let side = Side::new(&computer, None);
+        let (mcu, _, is_missing) = target.mcu(None).unwrap();
+        let edits = target.plan(&side, device, None, "[x]\n", is_missing.then_some(&*mcu)).unwrap();
+        let name = |edit: &Edit| edit.file.strip_prefix("/home/pi").unwrap_or(&edit.file).display().to_string();
+        edits.iter().map(|edit| (name(edit).replace("printer_data/config/", ""), edit.new.clone().unwrap())).collect()
     }
 
     #[test]
     fn a_device_has_its_file_and_one_include_for_all() {
-        let (tree, printer) = read(&[(
+        let (tree, target) = read(&[(
             "printer.cfg",
             "# mine\n[mcu]\nserial: /dev/x\n[stepper_x]\nposition_max: 250 # mm\n[stepper_y]\nposition_min: -5\nposition_max: 210\n",
         )]);
-        let changes = plan(&tree, &printer, "adxl345");
+        let changes = plan(&tree, &target, "adxl345");
         let names: Vec<&str> = changes.iter().map(|(name, _)| name.as_str()).collect();
-        assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/adxl345.cfg", "printer.cfg"]);
+        assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/adxl345.cfg", "pinion/resonance_tester.cfg", "printer.cfg"]);
         assert!(changes[0].1.ends_with("[mcu host]\nserial: /tmp/klipper_host_mcu\n"));
-        assert!(
-            changes[1].1.ends_with(
-                "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 125, 105, 20\n"
-            ),
-            "{}",
-            changes[1].1
-        );
-        assert_eq!(changes[2].1, "[include pinion/*.cfg]\n");
-        assert_eq!(printer.include().at, 0);
+        let tester = "accel_chip: adxl345\n# The middle of the bed, and 20 mm above it\nprobe_points: 125, 105, 20\n";
+        assert!(changes[2].1.ends_with(tester), "{}", changes[2].1);
+        assert!(changes[3].1.starts_with("[include pinion/*.cfg] # by pinion add\n# mine\n"));
+        for (_, text) in &changes[..3] {
+            assert_eq!(is_ours(text), Some(true));
+            assert_eq!(
+                is_ours(&text.replace("serial", "Serial").replace("[x]", "[y]").replace("x: ", "")),
+                Some(!text.contains("serial") && !text.contains("[x]"))
+            );
+        }
+        assert_eq!(is_ours("[x]\n"), None);
     }
 
     #[test]
     fn what_printer_cfg_has_already_is_not_written_again() {
-        let (tree, printer) = read(&[
+        let (tree, target) = read(&[
             (
                 "printer.cfg",
                 "[include pinion/*.cfg]\n[include other.cfg]\n[stepper_a]\n[fan]\npin: !rpi:GPIO17, rpi:gpio27\n",
@@ -401,57 +537,49 @@ mod tests {
             ("other.cfg", "[mcu rpi]\nserial: /tmp/klipper_host_mcu\n[resonance_tester]\naccel_chip: x\n[adxl345]\n"),
             ("pinion/relay.cfg", "[output_pin relay]\npin: rpi:GPIO22\n"),
         ]);
-        assert_eq!(printer.mcu(), ("rpi".into(), false));
-        assert_eq!(printer.link(), Path::new("/tmp/klipper_host_mcu"));
-        let changes = plan(&tree, &printer, "lis2dw");
-        assert_eq!(
-            changes,
-            [("pinion/lis2dw.cfg".into(), "# Written by pinion add lis2dw. accelerometer LIS2DW12\n[x]\n".into())]
-        );
-        assert_eq!(plan(&tree, &printer, "relay"), [], "its file is there");
-        let catalog = Catalog::read().unwrap();
-        let elsewhere = printer.elsewhere(catalog.device("adxl345").unwrap()).unwrap();
-        assert!(elsewhere.ends_with("other.cfg"));
-        assert_eq!(printer.elsewhere(catalog.device("relay").unwrap()), None);
-        let taken = |device: &str| printer.taken(catalog.device(device).unwrap()).into_iter().collect::<Vec<_>>();
-        assert_eq!(taken("light"), ["GPIO17", "GPIO22", "gpio27"]);
-        assert_eq!(taken("relay"), ["GPIO17", "gpio27"], "a second call chooses the same line");
-        assert_eq!(printer.probe_point().unwrap(), "0, 0, 20");
+        assert_eq!(target.mcu(None).unwrap(), ("rpi".into(), LINK.into(), false));
+        let changes = plan(&tree, &target, "lis2dw");
+        assert_eq!(changes.len(), 1, "{changes:?}");
+        assert!(changes[0].1.ends_with(": accelerometer LIS2DW12\n[x]\n"), "{changes:?}");
+        assert_eq!(plan(&tree, &target, "relay"), [], "its file is there");
+        assert_eq!(target.probe_point().unwrap(), "0, 0, 20");
     }
 
+    /// An MCU of another computer, or of another board, is not this one's, whatever its name.
     #[test]
-    fn pins_of_another_mcu_are_not_this_computer_s() {
-        let taken = |text: &str| {
-            let catalog = Catalog::read().unwrap();
-            let (_tree, printer) = read(&[("printer.cfg", text)]);
-            let taken = printer.taken(catalog.device("relay").unwrap());
-            (printer.mcu().0, taken.into_iter().collect::<Vec<_>>())
-        };
-        // A main board whose pins have a Raspberry Pi's names.
-        let pico = "[mcu]\nserial: /dev/serial/by-id/x\n[fan]\npin: gpio17\n[mcu pi]\nserial: /tmp/klipper_host_mcu\n\
-                    [output_pin a]\npin: !pi:gpio27\n";
-        assert_eq!(taken(pico), ("pi".into(), vec!["gpio27".into()]));
-        // Any path that klippy takes for a pseudo terminal.
-        let folder = "[mcu rpi]\nserial: /tmp/klipper_host_mine/tty\n[fan]\npin: rpi:GPIO17\n";
-        assert_eq!(taken(folder), ("rpi".into(), vec!["GPIO17".into()]));
-        // Pinion as the only MCU.
-        let alone = "[mcu]\nserial: /tmp/klipper_host_mcu\n[fan]\npin: !GPIO17\n[x]\na_pins: mcu:GPIO5, ^ebb:GPIO6\n";
-        assert_eq!(taken(alone), ("mcu".into(), vec!["GPIO17".into(), "GPIO5".into()]));
+    fn the_mcu_of_this_computer_is_the_one_that_is_served_here() {
+        let mcu =
+            |text: &str| read(&[("printer.cfg", text)]).1.mcu(None).map(|(name, _, is_missing)| (name, is_missing));
+        let bed = "[mcu bedpi]\nserial: /tmp/klipper_host_bedpi\n";
+        let own = "[mcu zz]\nserial: /tmp/klipper_host_mcu\n";
+        assert_eq!(mcu(""), Ok(("host".into(), true)));
+        assert_eq!(mcu(bed), Ok(("host".into(), true)), "pinion link has this one");
+        assert_eq!(mcu(&format!("{bed}{own}")), Ok(("zz".into(), false)));
+        assert_eq!(mcu("[mcu host]\nserial: /dev/serial/by-id/usb-pico\n"), Ok(("host2".into(), true)));
+        assert_eq!(mcu("[mcu host]\ncanbus_uuid: 1\n[mcu host2]\nserial: /dev/x\n"), Ok(("host3".into(), true)));
+        let (tree, target) = read(&[("printer.cfg", &format!("{bed}[mcu x]\nserial: /dev/x\n"))]);
+        let named = Target::find(&tree.computer(), None, Some("bedpi")).unwrap();
+        assert_eq!(named.mcu(Some("bedpi")).unwrap().0, "bedpi", "the user knows better");
+        assert!(target.mcu(Some("x")).unwrap_err().starts_with("--mcu: \"x\" is not an MCU of this computer"));
     }
 
     #[test]
     fn the_include_comes_where_no_section_is_cut() {
-        for (text, at, new) in [
-            ("[include a.cfg]\n[fan]\npin: x\n[include b.cfg]\n\n[x]\n", 45, "[include pinion/*.cfg]\n"),
-            ("[fan]\r\npin: x\r\n", 0, "[include pinion/*.cfg]\r\n"),
-            ("[include a.cfg]", 15, "\n[include pinion/*.cfg]\n"),
-            ("", 0, "[include pinion/*.cfg]\n"),
-            ("#[include a.cfg]\n", 0, "[include pinion/*.cfg]\n"),
+        let include = INCLUDE;
+        for (text, new) in [
+            (
+                "[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\n\n[x]\n",
+                "[include a*.cfg]\n[fan]\npin: x\n[include b*.cfg]\nNEW\n\n[x]\n",
+            ),
+            ("[fan]\r\npin: x\r\n", "NEW\r\n[fan]\r\npin: x\r\n"),
+            ("[include a*.cfg]", "[include a*.cfg]\nNEW\n"),
+            ("", "NEW\n"),
+            ("#[include a.cfg]\n", "NEW\n#[include a.cfg]\n"),
         ] {
-            let (_tree, printer) = read(&[("printer.cfg", text)]);
-            let splice = printer.include();
-            assert_eq!((splice.at, &*splice.new), (at, new), "{text:?}");
+            let (_tree, target) = read(&[("printer.cfg", text)]);
+            assert_eq!(target.with_include(), new.replace("NEW", include), "{text:?}");
         }
+        assert_eq!(included(include), Some("pinion/*.cfg"), "klippy reads it");
     }
 
     /// klippy looks for includes beside the link.
@@ -461,18 +589,14 @@ mod tests {
         tree.put("home/pi/dotfiles/printer.cfg", "[include other.cfg]\n[fan]\npin: a\n");
         tree.put("home/pi/printer_data/config/other.cfg", "[adxl345]\n");
         tree.link("home/pi/printer_data/config/printer.cfg", "../../dotfiles/printer.cfg");
-        let error = Printer::read(&tree.computer(), Path::new(CONFIG)).unwrap_err();
+        let computer = tree.computer();
+        let error = Target::find(&computer, Some(Path::new(CONFIG)), None).err().unwrap();
         let file = "/home/pi/dotfiles/printer.cfg";
         assert!(error.ends_with(&format!("--config {file}")), "{error}");
-        let printer = Printer::find(&tree.computer(), Some(Path::new(file))).unwrap();
-        assert!(printer.config.section("adxl345").is_some(), "{printer:?}");
-        let computer = tree.computer();
-        let side = Side { computer: &computer, owner: None, records: printer.folder() };
-        let catalog = Catalog::read().unwrap();
-        let (changes, _) = printer.plan(&side, catalog.device("relay").unwrap(), "[x]\n").unwrap();
-        let files: Vec<&str> = changes.iter().map(|change| change.file.to_str().unwrap()).collect();
-        let folder = "/home/pi/printer_data/config/pinion";
-        assert_eq!(files, [&*format!("{folder}/host-mcu.cfg"), &*format!("{folder}/relay.cfg"), file]);
+        let target = Target::find(&computer, Some(Path::new(file)), None).unwrap();
+        assert!(target.config().section("adxl345").is_some());
+        let names: Vec<String> = plan(&tree, &target, "relay").into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["pinion/host-mcu.cfg", "pinion/relay.cfg", "dotfiles/printer.cfg"]);
     }
 
     #[test]
@@ -484,17 +608,56 @@ mod tests {
         assert!(find(&tree.computer(), None).unwrap_err().contains("several hosts"));
         tree.put("etc/shadow", "x");
         tree.link("home/c/printer.cfg", "../../etc/shadow");
-        let error = Printer::read(&tree.computer(), Path::new("/home/c/printer.cfg")).unwrap_err();
+        let error = Target::find(&tree.computer(), Some(Path::new("/home/c/printer.cfg")), None).err().unwrap();
         assert!(error.ends_with("it is a link: name the file that it leads to: --config /etc/shadow"), "{error}");
         // A file that includes itself, or everything.
         let path = Path::new("/home/a/printer_data/config/printer.cfg");
         for (text, refusal) in [
             ("[include *.cfg]\n", "printer.cfg:1: Recursive include of config file"),
-            ("[include /*/*]\n", "/etc/shadow:1: File contains no section headers."),
+            ("[a]\nno value\n", "printer.cfg:2: Source contains parsing errors"),
         ] {
             tree.put("home/a/printer_data/config/printer.cfg", text);
-            let error = Printer::read(&tree.computer(), path).unwrap_err();
+            let error = Target::find(&tree.computer(), Some(path), None).err().unwrap();
             assert!(error.contains(refusal), "{error}");
         }
+    }
+
+    /// Each printer has its own.
+    #[test]
+    fn moonraker_is_the_one_beside_the_configuration() {
+        let (tree, target) = read(&[("printer.cfg", "")]);
+        let computer = tree.computer();
+        let address = |target: &Target| target.moonraker(&computer);
+        assert_eq!(address(&target), Ok("127.0.0.1:7125".into()));
+        tree.put("home/pi/printer_2_data/config/printer.cfg", "");
+        assert!(address(&target).unwrap_err().contains("--moonraker ADDRESS"));
+        tree.put("home/pi/printer_2_data/config/moonraker.conf", "[server]\nhost: 0.0.0.0\nport: 7126\n");
+        let second =
+            Target::find(&computer, Some(Path::new("/home/pi/printer_2_data/config/printer.cfg")), None).unwrap();
+        assert_eq!(address(&second), Ok("127.0.0.1:7126".into()));
+        tree.put("home/pi/printer_2_data/config/moonraker.conf", "[server]\nhost: ::1\n");
+        assert_eq!(address(&second), Ok("[::1]:7125".into()));
+    }
+
+    #[test]
+    fn the_lines_of_an_earlier_call_are_found_by_the_template() {
+        let catalog = Catalog::read().unwrap();
+        let driver = "[manual_stepper feeder]\nstep_pin: host:GPIO17\ndir_pin: !host:GPIO27\nenable_pin: !host:GPIO6\n[tmc2209 manual_stepper feeder]\nuart_pin: host:ttyAMA3\n";
+        let (_tree, target) = read(&[
+            ("printer.cfg", "[include pinion/*.cfg]\n[mcu host]\nserial: /tmp/klipper_host_mcu\n"),
+            ("pinion/tmc2209.cfg", driver),
+            ("pinion/relay-bed.cfg", "[output_pin bed]\npin: !host:GPIO5\n"),
+        ]);
+        let written = |device: &str, name: Option<&str>| {
+            let device = catalog.device(device).unwrap();
+            target
+                .written_pins(device, &device.way[0], name)
+                .into_iter()
+                .map(|(role, pin)| format!("{role} {pin}"))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(written("tmc2209", None), ["line GPIO17", "line2 GPIO27", "uart ttyAMA3", "up GPIO6"]);
+        assert_eq!(written("relay", Some("bed")), ["line GPIO5"]);
+        assert_eq!(written("relay", None), [""; 0]);
     }
 }

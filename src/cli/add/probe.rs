@@ -8,7 +8,8 @@ use pinion_firmware::board::{Board as _, BusDevice, BusError, BusStatus, I2cConf
 use pinion_linux::LinuxBoard;
 use pinion_linux::gpio::FastGpio;
 
-use super::catalog::{Catalog, Check, Detect, Fault, Kind, Read, Way};
+use super::catalog::{Catalog, Check, Detect, Fault, Read, Way};
+use crate::cli::computer::board::Kind;
 
 /// How often a register is read. A loose wire answers differently each time.
 const READS: usize = 8;
@@ -83,12 +84,12 @@ impl Buses for Live {
     }
 }
 
-/// Asks the device.
+/// Asks the device, on I2C at these addresses.
 ///
 /// # Errors
 ///
 /// One line: the answer, its meaning and the remedy.
-pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result<Answer, String> {
+pub(super) fn ask(catalog: &Catalog, way: &Way, addresses: &[u8], buses: &mut dyn Buses) -> Result<Answer, String> {
     let Some(check) = &way.check else {
         return Ok(Answer { text: "it cannot be asked: try it out".into(), address: None });
     };
@@ -113,7 +114,7 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
     }
     let mut others = Vec::new();
     let mut wrong = None;
-    for address in &way.addresses {
+    for address in addresses {
         let mut device = buses.i2c(*address)?;
         match asked(catalog, check, buses, &mut *device) {
             Ok(text) => {
@@ -130,7 +131,7 @@ pub(super) fn ask(catalog: &Catalog, way: &Way, buses: &mut dyn Buses) -> Result
     if let Some(wrong) = wrong {
         return Err(wrong);
     }
-    let asked: Vec<String> = way.addresses.iter().map(|address| format!("{address:#04x}")).collect();
+    let asked: Vec<String> = addresses.iter().map(|address| format!("{address:#04x}")).collect();
     Err(format!("nobody answers at {}: check power, ground, and that SDA and SCL are not swapped", asked.join(" or ")))
 }
 
@@ -377,7 +378,7 @@ mod tests {
         let catalog = Catalog::read().unwrap();
         let way = &catalog.device(device).unwrap().way[way];
         let mut chips = Chips(chips.iter().map(|(address, bytes)| (*address, bytes.to_vec())).collect());
-        ask(&catalog, way, &mut chips)
+        ask(&catalog, way, &way.addresses, &mut chips)
     }
 
     #[test]
@@ -498,12 +499,12 @@ mod tests {
                 for (what, answer) in answers {
                     let addresses = way.addresses.iter().copied().chain([0]);
                     let mut chips = Chips(addresses.map(|address| (address, answer.clone())).collect());
-                    let text = ask(&catalog, way, &mut chips);
+                    let text = ask(&catalog, way, &way.addresses, &mut chips);
                     assert!(text.is_err(), "{} by {:?}, {what} {answer:x?}: {text:?}", device.name, way.bus);
                     asked += 1;
                 }
                 if !way.addresses.is_empty() {
-                    let text = ask(&catalog, way, &mut Chips::default()).unwrap_err();
+                    let text = ask(&catalog, way, &way.addresses, &mut Chips::default()).unwrap_err();
                     assert!(text.starts_with("nobody answers at 0x"), "{}: {text}", device.name);
                 }
             }
@@ -534,7 +535,10 @@ mod tests {
 
         fn ask(&mut self, device: &str) -> Result<Answer, String> {
             let catalog = Catalog::read().unwrap();
-            ask(&catalog, &catalog.device(device).unwrap().way[0], self)
+            {
+                let way = &catalog.device(device).unwrap().way[0];
+                ask(&catalog, way, &way.addresses, self)
+            }
         }
     }
 
@@ -603,7 +607,7 @@ mod tests {
                 for way in &device.way {
                     let addresses = way.addresses.iter().chain([&0]);
                     let mut chips = Chips(addresses.map(|address| (*address, answers.clone())).collect());
-                    let _ = ask(&catalog, way, &mut chips);
+                    let _ = ask(&catalog, way, &way.addresses, &mut chips);
                 }
             }
         }

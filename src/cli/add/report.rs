@@ -13,6 +13,8 @@ pub(super) struct Report {
     pub(super) json: bool,
     pub(super) values: serde_json::Map<String, Value>,
     pub(super) page: Page,
+    /// The files that this call has changed.
+    pub(super) changed: Vec<String>,
 }
 
 impl Report {

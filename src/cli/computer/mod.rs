@@ -3,6 +3,7 @@
 //! `manager.rs` the settings of systemd itself, and `running.rs` its processes.
 
 use std::env;
+use std::ffi::OsString;
 use std::fs;
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
@@ -18,10 +19,14 @@ use pinion_linux::foreign;
 use pinion_printer_config::{Disk, Files};
 use pinion_runtime::klippy::process::Ids;
 
+pub(super) mod board;
 pub(super) mod device;
+pub(super) mod klippy;
 pub(super) mod manager;
+pub(super) mod printer;
 pub(super) mod running;
 pub(super) mod units;
+pub(super) mod uses;
 
 /// Longest text that is read. Every file that is read here is shorter.
 const TEXT_MAX: u64 = 4 << 20;
@@ -87,6 +92,11 @@ impl Computer {
         self.root == Path::new("/")
     }
 
+    /// The option that makes a command look at this computer, with a space before it.
+    pub(in crate::cli) fn root_option(&self) -> String {
+        if self.is_this() { String::new() } else { format!(" --root {}", foreign::word(self.root.display())) }
+    }
+
     /// Where this program finds a file of the computer.
     pub(in crate::cli) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
         let path = path.as_ref();
@@ -100,13 +110,13 @@ impl Computer {
 
     /// A file's text without the white space around it. `None` if the file is missing or cannot be read.
     pub(in crate::cli) fn text(&self, path: impl AsRef<Path>) -> Option<String> {
-        let bytes = foreign::read(&self.path(path), TEXT_MAX).ok()?;
+        let bytes = foreign::read(&self.resolve(path.as_ref()).ok()?, TEXT_MAX).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
 
     /// The names in a folder, in order. Empty if the folder is missing.
     fn names(&self, folder: &Path) -> Vec<String> {
-        let entries = fs::read_dir(self.path(folder)).into_iter().flatten().flatten();
+        let entries = self.resolve(folder).and_then(fs::read_dir).into_iter().flatten().flatten();
         let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
         names.sort();
         names
@@ -135,13 +145,60 @@ impl Computer {
                 None => paths.iter_mut().for_each(|path| path.push(&*part)),
             }
         }
-        let paths = paths.into_iter().map(|path| self.path(path));
-        paths.filter(|path| !is_pattern || fs::symlink_metadata(path).is_ok()).collect()
+        // The last name itself may be a link.
+        let is_there = |path: &PathBuf| {
+            let folder = self.resolve(path.parent().unwrap_or(Path::new("/")));
+            folder.is_ok_and(|folder| fs::symlink_metadata(folder.join(path.file_name().unwrap_or_default())).is_ok())
+        };
+        paths.retain(|path| !is_pattern || is_there(path));
+        paths.into_iter().map(|path| self.path(path)).collect()
     }
 
     /// The first of these files that exists.
     pub(in crate::cli) fn first<'a>(&self, paths: &[&'a str]) -> Option<&'a str> {
-        paths.iter().find(|path| self.path(path).exists()).copied()
+        paths.iter().find(|path| self.exists(path)).copied()
+    }
+
+    /// Whether a file is there.
+    pub(in crate::cli) fn exists(&self, path: impl AsRef<Path>) -> bool {
+        self.resolve(path.as_ref()).is_ok_and(|path| path.exists())
+    }
+
+    /// Where this program finds the file behind a path. Each link on the way leads where it leads on the computer itself:
+    /// an absolute link on a mounted card stays on the card. A name that is missing stays as it is.
+    pub(in crate::cli) fn resolve(&self, path: &Path) -> io::Result<PathBuf> {
+        if self.is_this() {
+            return Ok(path.to_owned());
+        }
+        let steps = |path: &Path| -> Vec<OsString> {
+            let names =
+                path.components().rev().filter(|step| matches!(step, Component::Normal(_) | Component::ParentDir));
+            names.map(|step| step.as_os_str().to_owned()).collect()
+        };
+        // The last one is the next.
+        let mut way = steps(path);
+        let mut found = PathBuf::from("/");
+        let mut links = 0;
+        while let Some(step) = way.pop() {
+            if step == ".." {
+                found.pop();
+                continue;
+            }
+            let next = found.join(&step);
+            let Ok(target) = fs::read_link(self.path(&next)) else {
+                found = next;
+                continue;
+            };
+            links += 1;
+            if links > LINKS_MAX {
+                return Err(io::Error::from_raw_os_error(libc::ELOOP));
+            }
+            if target.is_absolute() {
+                found = PathBuf::from("/");
+            }
+            way.extend(steps(&target));
+        }
+        Ok(self.path(found))
     }
 
     /// Follows symbolic links as the computer itself would. Returns all paths on the way. The last one is no link.
@@ -231,8 +288,7 @@ impl Computer {
 /// The computer's configurations of klippy. A link leads where it leads on that computer.
 impl Files for Computer {
     fn text(&self, path: &Path) -> io::Result<String> {
-        let file = self.follow(path)?.pop().ok_or(io::ErrorKind::NotFound)?;
-        Ok(String::from_utf8_lossy(&foreign::read(&file, TEXT_MAX)?).into_owned())
+        Ok(String::from_utf8_lossy(&foreign::read(&self.resolve(path)?, TEXT_MAX)?).into_owned())
     }
 
     fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {

@@ -6,6 +6,7 @@ use std::fs;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
+use crate::cli::computer::board::{append, is_pi, model, pi_config};
 use crate::cli::computer::device::Port;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
@@ -95,7 +96,7 @@ const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
 
 /// Whether the users that Pinion runs as may open the devices, and these serial ports. Without a service it judges the
 /// caller.
-pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &BTreeSet<&str>) -> Vec<Finding> {
+pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &BTreeSet<String>) -> Vec<Finding> {
     let on_pins = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
     let mut users: Vec<(Who, Vec<&Instance>)> = Vec::new();
     for (who, instance) in on_pins.filter_map(|instance| Some((instance.user(computer)?, instance))) {
@@ -115,7 +116,7 @@ pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &B
 }
 
 /// Whether `user` may open the devices. These instances run as `user`.
-fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, ports: &BTreeSet<&str>) -> Vec<Finding> {
+fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, ports: &BTreeSet<String>) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
         [] => "log in anew, and start Pinion anew".to_owned(),
@@ -257,12 +258,8 @@ fn present(computer: &Computer, class: &Class) -> Finding {
         ),
         true => Finding::warning(check, format!("{name}: on in {config}, and not there"), "sudo reboot"),
         false => Finding::ok(check, format!("{name}: off"))
-            .or(format!("if it is wanted: printf '[all]\\n{line}\\n' | sudo tee -a {config}, and reboot")),
+            .or(format!("if it is wanted: {}, and reboot", append(computer, line))),
     }
-}
-
-pub(super) fn model(computer: &Computer) -> String {
-    computer.text("/proc/device-tree/model").unwrap_or_default()
 }
 
 /// The subsystem of a node in /dev that is another device than its name says, such as a null device.
@@ -273,19 +270,10 @@ fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<St
     (subsystem != class.subsystem).then_some(subsystem)
 }
 
-pub(super) fn is_pi(computer: &Computer) -> bool {
-    model(computer).contains("Raspberry Pi")
-}
-
 /// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
 pub(super) fn is_pi5(computer: &Computer) -> bool {
     let model = model(computer);
     ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model.starts_with(name))
-}
-
-/// A Raspberry Pi's config.txt.
-pub(super) fn pi_config(computer: &Computer) -> Option<&'static str> {
-    computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
 }
 
 /// Whether the GPIO chip is a Raspberry Pi 5's: its registers have a node with a number.
@@ -305,7 +293,7 @@ mod tests {
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
         let instances = instances(&tree.computer()).0;
-        permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user, &["ttyAMA1"].into())
+        permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user, &["ttyAMA1".to_owned()].into())
     }
 
     /// A user other than root and other than the one that runs the tests.

@@ -3,14 +3,15 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::cli::computer::Computer;
+use crate::cli::computer::board::{append, is_pi, model, pi_config};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use pinion_linux::gpio::FastGpio;
 
-use super::devices::{FAST, is_pi, is_rp1, model, pi_config};
+use super::devices::{FAST, is_rp1};
 use super::instance::Instance;
 
 const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
@@ -68,7 +69,7 @@ impl Vpu {
 }
 
 /// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
-pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
+pub(super) fn leds(computer: &Computer, pins: &BTreeSet<String>) -> Vec<Finding> {
     const CHECK: &str = "leds";
     let model = model(computer);
     let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
@@ -82,7 +83,7 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
         false => Finding::warning(
             CHECK,
             format!("LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"),
-            format!("printf '[all]\\n{lines}\\n' | sudo tee -a {config}, and reboot"),
+            format!("{}, and reboot", append(computer, lines)),
         ),
     };
     let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
@@ -94,7 +95,11 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
 }
 
 /// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
-pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(&Path, &str)>) -> Vec<Finding> {
+pub(super) fn line_leds(
+    computer: &Computer,
+    instances: &[Instance],
+    pins: &BTreeSet<(PathBuf, String)>,
+) -> Vec<Finding> {
     let own = |link: &Path| {
         let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
         own.find(|instance| instance.link.as_deref() == Some(link))
@@ -147,7 +152,7 @@ mod tests {
             let tree = Tree::new();
             tree.put("proc/device-tree/model", model);
             tree.put("boot/firmware/config.txt", config);
-            leds(&tree.computer(), &[pin].into())
+            leds(&tree.computer(), &[pin.to_owned()].into())
         };
         for (model, held, loose, remedy) in [
             (
@@ -200,7 +205,8 @@ mod tests {
             tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
             tree.put("etc/pinion/pinion.toml", settings);
             nodes.iter().for_each(|(node, mode)| tree.put_mode(node, "", *mode));
-            let pins = [(Path::new("/tmp/klipper_host_mcu"), pin), (Path::new("/dev/board"), "PA1")];
+            let pins = [("/tmp/klipper_host_mcu", pin), ("/dev/board", "PA1")];
+            let pins = pins.map(|(link, pin)| (PathBuf::from(link), pin.to_owned()));
             line_leds(&tree.computer(), &instances(&tree.computer()).0, &pins.into())
         };
         let refused = |nodes: &[(&str, u32)], settings: &str, why: &str| {

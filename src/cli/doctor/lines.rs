@@ -3,24 +3,24 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::cli::computer::Computer;
+use crate::cli::computer::board::is_pi;
+use crate::cli::computer::printer::line_of;
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use pinion_linux::Inventory;
 use pinion_linux::gpio::Chip;
 use pinion_linux::pins::{Names, line_number};
 
-use super::devices::is_pi;
 use super::instance::Instance;
-use super::printer::line_of;
 
 /// The pins whose MCU is one of these instances, and has this computer's lines.
-pub(super) fn of_instances<'a>(instances: &[Instance], pins: &BTreeSet<(&Path, &'a str)>) -> BTreeSet<&'a str> {
+pub(super) fn of_instances<'a>(instances: &[Instance], pins: &'a BTreeSet<(PathBuf, String)>) -> BTreeSet<&'a str> {
     let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
     let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
-    pins.iter().filter(|(link, _)| links.contains(link)).map(|(_, pin)| *pin).collect()
+    pins.iter().filter(|(link, _)| links.contains(&link.as_path())).map(|(_, pin)| pin.as_str()).collect()
 }
 
 /// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
@@ -172,7 +172,8 @@ mod tests {
         let tree = Tree::new();
         tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
         let (host, board) = (Path::new("/tmp/klipper_host_mcu"), Path::new("/dev/board"));
-        let pins = || of_instances(&instances(&tree.computer()).0, &[(host, "gpio17"), (board, "gpio18")].into());
+        let all = [(host, "gpio17"), (board, "gpio18")].map(|(link, pin)| (link.to_owned(), pin.to_owned())).into();
+        let pins = || of_instances(&instances(&tree.computer()).0, &all);
         assert_eq!(pins(), ["gpio17"].into());
         tree.put("etc/pinion/pinion.toml", "board = \"sim\"\n");
         assert!(pins().is_empty());

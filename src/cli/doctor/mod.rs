@@ -15,13 +15,17 @@ use pinion_runtime::latency::{self, Assessment, Fitness};
 
 use super::add;
 use super::computer::Computer;
+use super::computer::board::Board;
+use super::computer::klippy::klippys;
 use super::computer::manager::SYSTEMCTL;
+use super::computer::printer::Printer;
+use super::computer::uses::Uses;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
 use super::{failed, quietly};
 
 mod devices;
-pub(super) mod host;
+mod host;
 mod instance;
 mod kernel;
 mod klipper;
@@ -30,13 +34,12 @@ mod leds;
 mod lines;
 mod outputs;
 mod power;
-pub(super) mod printer;
 mod serial;
 mod service;
 mod terminal;
+mod uses;
 
-#[cfg(fuzzing)]
-pub use printer::printer_cfg;
+pub(super) use uses::without_numpy;
 
 /// How to get the package, which is in no distribution's repository.
 const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
@@ -91,8 +94,12 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
 
 fn examine(computer: &Computer) -> Vec<Group> {
     let (instances, configurations) = instance::instances(computer);
-    let klippys = host::klippys(computer);
+    let klippys = klippys(computer);
+    let uarts = host::of_all(&klippys, Printer::uarts);
     let program = |path: &'static str| computer.is_this().then_some(Path::new(path));
+    let inventory = computer.is_this().then(Inventory::scan);
+    let board = Board::of(computer, None).unwrap_or_default();
+    let uses = Uses::find(computer, board.as_ref(), None, inventory.as_ref());
     let mut groups = vec![
         Group::new("last stop", vec![last_stop::finding(computer, SystemTime::now())]),
         Group::new("kernel", kernel::findings(computer, &instances)),
@@ -109,22 +116,25 @@ fn examine(computer: &Computer) -> Vec<Group> {
                 devices::presence(computer),
                 host::unchecked(&klippys),
                 outputs::released(computer),
-                leds::leds(computer, &host::leds(&klippys)),
-                leds::line_leds(computer, &instances, &host::line_leds(&klippys)),
-                serial::ports(computer, &host::uarts(&klippys)),
+                leds::leds(computer, &host::of_all(&klippys, Printer::spi_leds)),
+                leds::line_leds(computer, &instances, &host::of_all(&klippys, Printer::line_leds)),
+                serial::ports(computer, &uarts),
+                uses::conflicts(&uses),
+                uses::no_lines(&uses),
+                uses::slow_buses(computer, &klippys),
+                uses::numpy(computer, &klippys),
                 add::missing(computer, &klippys.iter().filter_map(|klippy| klippy.config.clone()).collect()),
             ]
             .concat(),
         ),
-        Group::new("permissions", devices::permissions(computer, &instances, &host::uarts(&klippys))),
+        Group::new("permissions", devices::permissions(computer, &instances, &uarts)),
         Group::new("power", power::power(computer, program("/usr/bin/vcgencmd"))),
     ];
-    if computer.is_this() {
+    if let Some(inventory) = &inventory {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
-        let inventory = Inventory::scan();
-        let pins = host::numbered_pins(&klippys);
+        let pins = host::of_all(&klippys, Printer::numbered);
         let lines = [
-            lines::header(computer, &inventory, &lines::of_instances(&instances, &pins)),
+            lines::header(computer, inventory, &lines::of_instances(&instances, &pins)),
             lines::holders(computer, &inventory.chips),
         ];
         groups.insert(7, Group::new("lines", lines.concat()));

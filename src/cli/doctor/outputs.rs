@@ -4,9 +4,8 @@
 use std::path::Path;
 
 use crate::cli::computer::Computer;
+use crate::cli::computer::board::append;
 use crate::cli::finding::Finding;
-
-use super::devices::pi_config;
 
 /// The parameter of a Raspberry Pi's pin drivers. It is "Y" by default in the Raspberry Pi's own kernel, and missing in
 /// older ones.
@@ -31,14 +30,14 @@ fn released_by(computer: &Computer, parameter: &Path) -> Option<Finding> {
         let found = "the kernel makes an output an input when nobody holds it any more: its resistor decides the level";
         return Some(Finding::ok(CHECK, found));
     }
-    let config = pi_config(computer).unwrap_or("config.txt");
     Some(Finding::warning(
         CHECK,
         format!(
             "a heater stays on if Pinion and its guardian die together: the kernel keeps the levels of outputs ({module}.persist_gpio_outputs)"
         ),
         format!(
-            "a resistor that keeps each heater's gate off, and printf '[all]\\ndtparam=strict_gpiod\\n' | sudo tee -a {config}, and reboot; outputs then also fall at each restart: docs/guide/safety.md"
+            "a resistor that keeps each heater's gate off, and {}, and reboot; outputs then also fall at each restart: /usr/share/doc/pinion-mcu/guide/safety.md",
+            append(computer, "dtparam=strict_gpiod")
         ),
     ))
 }
@@ -62,7 +61,9 @@ mod tests {
         parameter("pinctrl_bcm2835", "Y");
         tree.put("boot/firmware/config.txt", "");
         let remedy = says(&released(&tree.computer()), CHECK, Warning, "(pinctrl_bcm2835.persist_gpio_outputs)");
-        assert!(remedy.contains("dtparam=strict_gpiod\\n' | sudo tee -a /boot/firmware/config.txt"), "{remedy}");
+        let config = tree.computer().path("/boot/firmware/config.txt");
+        let command = format!("\\n[all]\\ndtparam=strict_gpiod\\n' | sudo tee -a {}, and", config.display());
+        assert!(remedy.contains(&command), "{remedy}");
         assert!(remedy.contains("gate") && remedy.contains("at each restart"), "{remedy}");
         // A Raspberry Pi 5 has both drivers, and pins of one. strict_gpiod is for that one.
         tree.put("sys/bus/platform/drivers/pinctrl-bcm2835/bind", "");

@@ -4,11 +4,10 @@
 use std::path::Path;
 use std::process::Command;
 
+use crate::cli::computer::board::is_pi;
 use crate::cli::computer::{Computer, output};
 use crate::cli::finding::Finding;
 use pinion_linux::throttled;
-
-use super::devices::is_pi;
 
 /// The report of a Raspberry Pi's firmware about its power and temperature. `vcgencmd` is the program that asks the
 /// firmware, if it may be started.

@@ -3,12 +3,13 @@
 
 use std::collections::BTreeSet;
 
+use crate::cli::computer::board::{append, is_pi, pi_config};
 use crate::cli::computer::device::Port;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
 use pinion_runtime::klippy::process::Process;
 
-use super::devices::{is_pi, is_pi5, pi_config};
+use super::devices::is_pi5;
 
 const CHECK: &str = "serial";
 /// Programs that set up a Bluetooth chip on a serial port.
@@ -17,7 +18,7 @@ const BLUETOOTH: [&str; 2] = ["hciattach", "btattach"];
 const LOGIN: [&str; 3] = ["agetty", "getty", "login"];
 
 /// Judges the ports that klippy's configuration names.
-pub(super) fn ports(computer: &Computer, names: &BTreeSet<&str>) -> Vec<Finding> {
+pub(super) fn ports(computer: &Computer, names: &BTreeSet<String>) -> Vec<Finding> {
     names.iter().flat_map(|name| port(computer, name)).collect()
 }
 
@@ -105,7 +106,9 @@ fn missing(computer: &Computer, named: &str) -> String {
         true if is_taken && ["ttyAMA0", "serial0", "serial1"].contains(&named) => no_bluetooth(computer),
         true => {
             let config = pi_config(computer).unwrap_or("config.txt");
-            format!("add the overlay of a UART to {config} (docs/guide/pins.md lists them), and reboot")
+            format!(
+                "add the overlay of a UART to {config} (/usr/share/doc/pinion-mcu/guide/pins.md lists them), and reboot"
+            )
         }
         false => "plug its adapter in, or enable it in the device tree (pinion pins lists the ports)".to_owned(),
     }
@@ -113,14 +116,13 @@ fn missing(computer: &Computer, named: &str) -> String {
 
 /// How a Raspberry Pi 5 gets the port of pins 8 and 10.
 fn header_of_pi5(computer: &Computer) -> String {
-    let config = pi_config(computer).unwrap_or("config.txt");
-    format!("printf '[all]\\ndtoverlay=uart0-pi5\\n' | sudo tee -a {config}, reboot")
+    format!("{}, reboot", append(computer, "dtoverlay=uart0-pi5"))
 }
 
 fn no_bluetooth(computer: &Computer) -> String {
-    let config = pi_config(computer).unwrap_or("config.txt");
     format!(
-        "choose another UART, or do without Bluetooth: printf '[all]\\ndtoverlay=disable-bt\\n' | sudo tee -a {config} && sudo systemctl disable hciuart, and reboot"
+        "choose another UART, or do without Bluetooth: {} && sudo systemctl disable hciuart, and reboot",
+        append(computer, "dtoverlay=disable-bt")
     )
 }
 
@@ -132,7 +134,7 @@ mod tests {
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
 
     fn judged(tree: &Tree, name: &str) -> Vec<Finding> {
-        ports(&tree.computer(), &[name].into())
+        ports(&tree.computer(), &[name.to_owned()].into())
     }
 
     fn tree(pi: bool) -> Tree {

@@ -105,6 +105,13 @@ fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
     });
     let policies: Vec<bool> = policies.collect();
     let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {}", word(unit)));
+    if !policies.is_empty()
+        && !policies.contains(&true)
+        && let Some((why, remedy)) = no_real_time(computer, pid)
+    {
+        let found = format!("Pinion (process {pid}) does not run in real time: {why}");
+        return Some(Finding::warning(CHECK, found, remedy));
+    }
     Some(match (policies.is_empty(), policies.contains(&true)) {
         (true, _) => Finding::ok(CHECK, format!("whether Pinion (process {pid}) runs in real time is unknown")),
         (_, true) => Finding::ok(CHECK, format!("Pinion (process {pid}) runs in real time")),
@@ -113,6 +120,31 @@ fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
             format!("Pinion (process {pid}) does not run in real time: it is not permitted"),
             format!("use the service; its log says what keeps it from that{log}"),
         ),
+    })
+}
+
+/// Why a process gets no real time although it is permitted: the kernel's groups, or a container without the capability.
+fn no_real_time(computer: &Computer, pid: u32) -> Option<(&'static str, String)> {
+    // With CONFIG_RT_GROUP_SCHED each group has a share of its own, and a new group's is 0.
+    let groups = computer.text(format!("/proc/{pid}/cgroup")).unwrap_or_default();
+    let has_none = groups.lines().any(|line| {
+        let mut fields = line.splitn(3, ':').skip(1);
+        let (Some(controllers), Some(group)) = (fields.next(), fields.next()) else { return false };
+        let share = computer.text(format!("/sys/fs/cgroup/{controllers}{group}/cpu.rt_runtime_us"));
+        controllers.split(',').any(|controller| controller == "cpu") && share.is_some_and(|share| share == "0")
+    });
+    if has_none {
+        let why = "the kernel (RT_GROUP_SCHED) gives its control group no share of it";
+        return Some((
+            why,
+            "sudo sysctl kernel.sched_rt_runtime_us=-1, or boot a kernel without RT_GROUP_SCHED".into(),
+        ));
+    }
+    let marks = ["/.dockerenv", "/run/.containerenv", "/run/systemd/container"];
+    let is_container = marks.iter().any(|file| computer.exists(file));
+    is_container.then(|| {
+        let why = "the container has no right to it";
+        (why, "start the container with --cap-add=sys_nice --ulimit rtprio=99".into())
     })
 }
 
@@ -132,9 +164,12 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     }
     let is_enabled = |unit: &str| instances.iter().any(|instance| instance.unit.as_deref() == Some(unit));
     let is_pinion_enabled = !units::enabled(computer, is_enabled).is_empty();
-    if let Some(unit) = units::enabled(computer, |unit| is_klipper_s(computer, unit)).first() {
-        let found = format!("{unit}.service is enabled: at boot it is started beside Pinion, and stops it");
-        findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {unit}.service")));
+    let enabled = units::enabled(computer, |unit| is_klipper_s(computer, unit));
+    if !enabled.is_empty() {
+        let names: Vec<String> = enabled.iter().map(|unit| format!("{unit}.service")).collect();
+        let (is, it) = if let [_] = names[..] { ("is", "it is") } else { ("are", "they are") };
+        let found = format!("{} {is} enabled: at boot {it} started beside Pinion, and stop it", names.join(" and "));
+        findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {}", names.join(" "))));
     } else if is_pinion_enabled
         && let Some((unit, file)) = units::all(computer).into_iter().find_map(|unit| {
             let file = units::file(computer, &unit).filter(|_| is_klipper_s(computer, &unit))?;
@@ -284,6 +319,13 @@ mod tests {
         let stat = |policy: &str| format!("11 (co) re) S {} {policy} 0", vec!["0"; 37].join(" "));
         tree.put("proc/10/task/11/stat", stat("0"));
         says(&found(&tree), "realtime", Warning, "not permitted");
+        // The cause, where it is known.
+        tree.put("run/.containerenv", "");
+        assert!(says(&found(&tree), "realtime", Warning, "the container has no right").contains("--cap-add=sys_nice"));
+        tree.put("proc/10/cgroup", "3:cpu,cpuacct:/system.slice/x.service\n0::/x\n");
+        tree.put("sys/fs/cgroup/cpu,cpuacct/system.slice/x.service/cpu.rt_runtime_us", "0\n");
+        let remedy = says(&found(&tree), "realtime", Warning, "(RT_GROUP_SCHED) gives its control group no share");
+        assert!(remedy.starts_with("sudo sysctl kernel.sched_rt_runtime_us=-1"), "{remedy}");
         tree.put("proc/10/task/12/stat", stat("1"));
         says(&found(&tree), "realtime", Ok, "runs in real time");
         // Each instance is judged.
@@ -302,6 +344,13 @@ mod tests {
             says(&found(&tree), "klipper_mcu", Error, "is enabled"),
             "sudo systemctl disable --now klipper-mcu.service"
         );
+        tree.link("etc/systemd/system/multi-user.target.wants/klipper_mcu.service", "/etc/systemd/system/x");
+        assert_eq!(
+            says(&found(&tree), "klipper_mcu", Error, "klipper-mcu.service and klipper_mcu.service are enabled"),
+            "sudo systemctl disable --now klipper-mcu.service klipper_mcu.service"
+        );
+        let second = "/etc/systemd/system/multi-user.target.wants/klipper_mcu.service";
+        fs::remove_file(tree.computer().path(second)).unwrap();
         tree.process(20, &["/usr/local/bin/klipper_mcu", "-r"], 0, &[]);
         says(&found(&tree), "klipper_mcu", Error, "runs (process 20)");
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");

@@ -7,13 +7,15 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::cli::check;
+use crate::cli::computer::klippy::Klippy;
+use crate::cli::computer::printer::Printer;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::{Finding, Level};
 use pinion_linux::foreign::word;
 use pinion_runtime::Place;
 use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
 
-use super::host::{Klippy, printers};
+use super::host::printers;
 use super::instance::{Instance, unit_for};
 
 const CHECK: &str = "terminal";
@@ -42,12 +44,12 @@ pub(super) fn terminals(computer: &Computer, instances: &[Instance], klippys: &[
         links.push(link);
         findings.extend(terminal(computer, link, Some(instance), klippys));
     }
-    let named = printers(klippys).flat_map(|printer| &printer.serials).map(PathBuf::as_path);
-    let others: BTreeSet<&Path> = named.filter(|path| !links.contains(path)).collect();
-    for path in others {
+    let named = printers(klippys).flat_map(Printer::serials);
+    let others: BTreeSet<PathBuf> = named.filter(|path| !links.contains(&path.as_path())).collect();
+    for path in &others {
         if is_host_path(path) {
             findings.extend(terminal(computer, path, None, klippys));
-        } else if let Some(instance) = instances.iter().find(|instance| instance.settings.symlink == path) {
+        } else if let Some(instance) = instances.iter().find(|instance| instance.settings.symlink == *path) {
             let found = format!("klippy's configuration names {}, which it takes for a serial port", path.display());
             let link = instance.link.as_ref().map_or(Path::new("/tmp/klipper_host_NAME"), PathBuf::as_path);
             findings.push(Finding::error(CHECK, found, format!("serial: {}", link.display())));
@@ -227,10 +229,10 @@ fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> b
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::klippys;
     use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::klippy::klippys;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
 

@@ -1,7 +1,9 @@
 # pinion add of the package: on this computer, which is no known board, and on the files of a Raspberry Pi's card with a
 # stand-in for Moonraker and klippy.
-pinion add | grep 'is not among the known boards'
+pinion add | grep 'so its board is not known'
 mkdir /run/add
+# The pages that its messages name are there.
+test -s /usr/share/doc/pinion-mcu/guide/pins.md
 not pinion add adxl345 --yes 2>/run/add/refused
 grep 'look up in its manual which pins have SPI' /run/add/refused
 

@@ -7,7 +7,7 @@ use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
@@ -17,8 +17,8 @@ use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
-use super::Attempt;
 use super::stall::Stalls;
+use super::{Attempt, rights};
 use crate::own::serve::Folder;
 use pinion_printer_config::Trouble;
 
@@ -84,7 +84,7 @@ impl Host {
     ///
     /// It cannot be started, or opens no API.
     pub(super) fn start(attempt: &Attempt, folder: &Folder) -> Result<Host, Trouble> {
-        let Attempt { klipper, python, realtime, running, .. } = attempt;
+        let Attempt { klipper, python, running, .. } = attempt;
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
         if !program.is_file() {
@@ -94,11 +94,7 @@ impl Host {
         let socket = folder.path.join("klippy.sock");
         let _ = std::fs::remove_file(&socket);
         let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
-        // While it homes, klippy is a tenth of a second ahead of the MCU, and a busy computer makes it late.
-        let mut command = Command::new(if *realtime { Path::new("chrt") } else { python });
-        if *realtime {
-            command.args(["-f", "1"]).arg(python);
-        }
+        let mut command = rights::confined(python);
         command.arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
         command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
         command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);

@@ -4,6 +4,7 @@
 mod host;
 mod place;
 mod report;
+pub(crate) mod rights;
 mod stall;
 mod steps;
 mod trial;
@@ -35,8 +36,6 @@ pub(crate) struct Attempt {
     /// Only these steps, if there are any.
     pub(crate) only: Vec<String>,
     pub(crate) form: Form,
-    /// klippy gets real time, too.
-    pub(crate) realtime: bool,
     /// The klippy, while it runs.
     pub(crate) running: Running,
 }

@@ -84,7 +84,7 @@ impl OwnArgs {
     /// # Errors
     ///
     /// There is no klippy.
-    pub(crate) fn attempt(&self, realtime: bool) -> Result<Option<Attempt>, Trouble> {
+    pub(crate) fn attempt(&self) -> Result<Option<Attempt>, Trouble> {
         if !self.attempt {
             return Ok(None);
         }
@@ -96,7 +96,6 @@ impl OwnArgs {
             gcode: self.gcode.clone(),
             only: self.only.clone(),
             form: self.form(),
-            realtime,
             running: Running::default(),
         }))
     }

@@ -3,9 +3,12 @@
 
 use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use nix::unistd::geteuid;
 use pinion_linux::foreign::plain;
+use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::Trouble;
 use toml::Table;
 
@@ -107,11 +110,23 @@ fn in_place(own: &Own, mcu: &str) -> Result<PathBuf, Trouble> {
         let remedy = "leave --in-place-pty out, or set `serial` to a path in /tmp";
         Err(section.trouble("serial", format!("{}: {cause}", path.display())).remedy(remedy))
     };
-    if !path.is_absolute() || path.starts_with("/dev") || path.starts_with("/sys") || path.starts_with("/proc") {
-        return refused("it is no place for a link");
+    if !path.is_absolute() {
+        return refused("it is not a place for a link");
     }
+    // The folder that it leads to by now, without `..` and links.
+    let folder = path.parent().unwrap_or(Path::new("/"));
+    let real = match OwnFolder::open(folder).and_then(|folder| fs::canonicalize(folder.at("."))) {
+        Ok(real) => real,
+        Err(error) => return refused(&error.to_string()),
+    };
+    if ["/dev", "/sys", "/proc"].iter().any(|kernels| real.starts_with(kernels)) {
+        return refused("it is not a place for a link");
+    }
+    let Some(name) = path.file_name() else { return refused("it is not a place for a link") };
+    let path = real.join(name);
     match fs::symlink_metadata(&path) {
         Ok(about) if !about.is_symlink() => refused("something else is there"),
+        Ok(about) if about.uid() != geteuid().as_raw() => refused("the link there belongs to another user"),
         _ => Ok(path),
     }
 }

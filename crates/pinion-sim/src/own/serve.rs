@@ -3,10 +3,13 @@
 //!
 //! The user's files are never changed. The copy differs in the way to each MCU and in the places where klippy writes.
 
-use std::fs;
+use std::fs::{self, Metadata};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use nix::unistd::geteuid;
 use pinion_linux::foreign::{self, word};
+use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::copy::{self, Change};
 use pinion_printer_config::pins::MAIN;
 use pinion_printer_config::{Config, Section, Trouble};
@@ -198,8 +201,10 @@ impl Folder {
         if let Some(section) = own.config.section("save_variables") {
             let variables = path.join("variables.cfg");
             let file = section.text("filename").map(at_home);
-            if let Some(Ok(bytes)) = file.map(|file| foreign::read(&file, VARIABLES_MAX)) {
-                fs::write(&variables, bytes).map_err(|error| failed(&variables, error))?;
+            if let Some(file) = file
+                && let Ok(bytes) = foreign::read(&file, VARIABLES_MAX)
+            {
+                copy::write_like(&file, &variables, &bytes).map_err(|error| failed(&variables, error))?;
             }
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
@@ -226,16 +231,18 @@ impl Folder {
 /// A file in a folder that this program made.
 const MARK: &str = ".pinion-sim";
 
-/// A folder that is new, empty, or made by an earlier run.
+/// A folder of our own that is new, empty, or made by an earlier run. In another user's folder, links of that user would
+/// lead the copies to any file.
 fn new_or_ours(path: &Path) -> Result<PathBuf, Trouble> {
-    let refused = |cause: String| Trouble::new(cause).of(path.display()).remedy("name a new folder");
-    fs::create_dir_all(path).map_err(|error| refused(format!("it cannot be made: {error}")))?;
-    let path = fs::canonicalize(path).map_err(|error| refused(error.to_string()))?;
-    let mut names = fs::read_dir(&path).map_err(|error| refused(error.to_string()))?;
-    if names.next().is_some() && !path.join(MARK).exists() {
+    let refused =
+        |cause: String| Trouble::new(cause).of(path.display()).remedy("name a new folder in a folder of yours");
+    let folder = OwnFolder::make(path).map_err(|error| refused(error.to_string()))?;
+    let mut names = fs::read_dir(folder.at(".")).map_err(|error| refused(error.to_string()))?;
+    let is_ours = |about: Metadata| about.is_file() && about.uid() == geteuid().as_raw();
+    if names.next().is_some() && !fs::symlink_metadata(folder.at(MARK)).is_ok_and(is_ours) {
         return Err(refused("it has files of somebody else".into()));
     }
-    Ok(path)
+    fs::canonicalize(folder.at(".")).map_err(|error| refused(error.to_string()))
 }
 
 /// A path whose `~` is the home folder.

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use pinion_printer_config::pins::{Aliases, MAIN, Pin};
 use pinion_printer_config::{Config, Section, Trouble};
+use pinion_sim::MCUS_MAX;
 use toml::Table;
 
 use super::claims;
@@ -79,7 +80,12 @@ fn mcus(config: &Config) -> Result<Vec<String>, Trouble> {
         return Err(Trouble::new("Option 'serial' in section 'mcu' must be specified").remedy("add [mcu]"));
     }
     let others = config.of_kind(MAIN).filter_map(Section::own_name).map(str::to_owned);
-    Ok(std::iter::once(MAIN.to_owned()).chain(others).collect())
+    let mcus: Vec<String> = std::iter::once(MAIN.to_owned()).chain(others).collect();
+    if mcus.len() > MCUS_MAX {
+        let cause = format!("it has {} MCUs, and at most {MCUS_MAX} are simulated", mcus.len());
+        return Err(Trouble::new(cause).remedy("leave some [mcu ...] out"));
+    }
+    Ok(mcus)
 }
 
 pub(super) struct Translator<'a> {

@@ -44,6 +44,8 @@ fn default_chip() -> String {
 
 /// Highest drift. No crystal is so bad.
 const DRIFT_PPM_MAX: f64 = 200.0;
+/// Highest number of MCUs of a printer. Each has six threads.
+pub const MCUS_MAX: usize = 16;
 
 /// The boards of a description. Without any there is one.
 #[derive(Clone, Copy, Debug)]
@@ -60,6 +62,10 @@ impl Boards<'_> {
     }
 
     pub(crate) fn validate(&self) -> Result<(), Trouble> {
+        if self.0.len() > MCUS_MAX {
+            let cause = format!("it has {} MCUs, and at most {MCUS_MAX} are simulated", self.0.len());
+            return Err(Trouble::new(cause).remedy("leave some out"));
+        }
         unique("[[mcu]]", self.0.iter().map(|mcu| &mcu.name))?;
         self.0.iter().try_for_each(|mcu| {
             let whose = &format!("mcu `{}`", mcu.name);

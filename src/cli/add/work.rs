@@ -1,0 +1,241 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The steps of one device: the wires, the bus, the chip's answer, the sections, the first value.
+
+use std::io;
+use std::path::Path;
+use std::process::Command;
+
+use pinion_runtime::klippy::HOST_PATHS;
+use serde_json::json;
+
+use super::catalog::{Catalog, Device, Way, is_line};
+use super::place::{Search, Wire};
+use super::plan::State;
+use super::printer::Target;
+use super::report::Report;
+use super::side::Side;
+use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
+use crate::cli::computer::Computer;
+use crate::cli::computer::board::{Board, Spot};
+use crate::cli::computer::running::Running;
+use crate::cli::files::Output;
+
+/// A device on its way into a printer.
+pub(super) struct Work<'a> {
+    pub(super) args: &'a AddArgs,
+    pub(super) computer: &'a Computer,
+    pub(super) catalog: &'a Catalog,
+    pub(super) board: &'a Board,
+    pub(super) device: &'a Device,
+    pub(super) way: &'a Way,
+    /// The place on the bus.
+    pub(super) spot: Spot,
+    pub(super) search: Search<'a>,
+    pub(super) report: &'a mut Report,
+}
+
+impl Work<'_> {
+    pub(super) fn name(&self) -> Option<&str> {
+        self.args.name.as_deref()
+    }
+
+    /// Its section of printer.cfg.
+    pub(super) fn section(&self) -> String {
+        self.search.there.clone().unwrap_or_else(|| self.device.section(self.name()))
+    }
+
+    /// Does it. Without a printer, all but its configuration.
+    pub(super) fn run(&mut self, target: Result<Target, String>) -> Result<(), String> {
+        let written =
+            target.as_ref().map(|target| target.written_pins(self.device, self.way, self.name())).unwrap_or_default();
+        let wires = match &self.search.there {
+            Some(_) => self.search.wires(self.device, self.way, &self.spot, &written, None)?,
+            None => self.search.wires(self.device, self.way, &self.spot, &written, self.args.pin.as_deref())?,
+        };
+        self.draw(&wires)?;
+        let moonraker = moonraker_of(self.args, self.computer, target.as_ref());
+        let rests = moonraker.clone().and_then(|address| refuse_while_printing(self.computer, address.as_deref()));
+        let may_ask = rests.is_ok();
+        if !self.args.dry_run {
+            rests?;
+        }
+        let moonraker = moonraker.unwrap_or_default();
+        let (boot, mut state) = self.plan_boot()?;
+        self.report.set("bus", json!(state.name()));
+        if !boot.is_empty() {
+            make(
+                self.args,
+                moonraker.as_deref(),
+                &Side::new(self.computer, None),
+                &boot,
+                "Change these files?",
+                self.report,
+            )?;
+            let is_live = self.computer.is_this() && !self.args.dry_run;
+            if is_live && state == State::NotLoaded {
+                let loaded = Command::new("modprobe").arg("i2c-dev").status();
+                if !loaded.is_ok_and(|status| status.success()) {
+                    return Err("modprobe i2c-dev failed: reboot, then call this again".into());
+                }
+                // The bus is there now, and the chip can be asked for its address.
+                state = State::There;
+            } else if is_live {
+                self.report.set("reboot", json!(true));
+                self.report.line("The bus is there after a reboot. Connect the wires while the power is off:");
+                self.report.line("  sudo poweroff");
+                self.report.line(format_args!("Then call \"{}\" again.", command(self.args, false)));
+                return Ok(());
+            }
+        }
+        if self.computer.is_this() && state == State::Due && boot.is_empty() {
+            return Err(format!(
+                "{} is enabled but does not exist yet: reboot, then run \"{}\" again",
+                self.node(),
+                command(self.args, false)
+            ));
+        }
+        let address = match self.computer.is_this() && state == State::There && may_ask {
+            true => self.check(target.as_ref().ok())?,
+            false => None,
+        };
+        self.configure(&target?, &wires, address, moonraker.as_deref())
+    }
+
+    pub(super) fn node(&self) -> &str {
+        &self.spot.node
+    }
+
+    fn draw(&mut self, wires: &[Wire]) -> Result<(), String> {
+        let (board, device) = (self.board, self.device);
+        let entry = |wire: &Wire| {
+            let label = board.label(wire.pin);
+            json!({ "device": wire.chip, "pin": wire.pin, "label": label, "line": board.line(wire.pin) })
+        };
+        self.report.set("wires", wires.iter().map(entry).collect());
+        self.report.set("trap", json!(device.trap));
+        self.report.line(format_args!("{} on {}, by {}", device.title, board.name, self.way.bus.name()));
+        self.report.line("");
+        self.report.page.append(&picture::page(board, wires));
+        self.report.line("");
+        self.report.line(format_args!("  level: {}", board.level));
+        self.report.line(format_args!("  mind:  {}", device.trap));
+        for one in self.search.uses.unknown() {
+            self.report.line(format_args!(
+                "  mind:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
+                one.place, one.user
+            ));
+        }
+        let unknown: Vec<&String> = self.search.uses.unknown().map(|one| &one.place).collect();
+        self.report.set("unknown", json!(unknown));
+        self.report.line("");
+        if let Some(path) = &self.args.picture {
+            // Another file has probably a name by mistake.
+            if std::fs::read(path).is_ok_and(|bytes| !bytes.starts_with(b"<svg ")) {
+                return Err(format!("{} exists, and is not a picture: name another file", path.display()));
+            }
+            let svg = picture::svg(board, &device.title, wires);
+            Output::check(path, &[])?.write(|out| io::Write::write_all(out, svg.as_bytes()))?;
+        }
+        self.report.show()
+    }
+
+    /// Writes the sections, and has the host read them.
+    fn configure(
+        &mut self,
+        target: &Target,
+        wires: &[Wire],
+        address: Option<u8>,
+        moonraker: Option<&str>,
+    ) -> Result<(), String> {
+        let side = Side::new(self.computer, Some(target.owner));
+        let (mcu, link, is_missing) = target.mcu(self.args.mcu.as_deref())?;
+        if self.computer.is_this() && !self.args.dry_run && !serves(self.computer, &link) {
+            // Without its MCU, klippy would not start with the new sections.
+            let link = link.display();
+            return Err(format!(
+                "Pinion does not serve at {link}: sudo systemctl enable --now pinion-mcu, then \"{}\"",
+                command(self.args, false)
+            ));
+        }
+        let mut is_changed = false;
+        if let Some(section) = &self.search.there {
+            let place = target.config().section(section).map_or(String::new(), |section| section.place.to_string());
+            self.report.line(format_args!(
+                "[{section}] is in printer.cfg already ({place}), and stays as it is. For a second one: {} --name NAME",
+                command(self.args, false)
+            ));
+        } else {
+            let sections = self.sections(target, &mcu, wires, address)?;
+            let edits = target.plan(&side, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
+            is_changed = !edits.is_empty();
+            make(self.args, moonraker, &side, &edits, "Write this?", self.report)?;
+        }
+        if self.args.dry_run {
+            self.report.line("Nothing was changed (--dry-run).");
+            return Ok(());
+        }
+        if !is_changed {
+            self.report.line("Nothing is left to change.");
+        }
+        if let Some(moonraker) = moonraker {
+            let is_own = self.search.there.is_none();
+            let undo = format!("{} takes it back", command(self.args, true));
+            self.measure(moonraker, is_changed).map_err(|why| if is_own { format!("{why}: {undo}") } else { why })?;
+        }
+        let next: Vec<String> = self.device.next.iter().map(|line| self.device.named(line, self.name())).collect();
+        self.report.set("next", json!(next));
+        self.report.line("Next:");
+        next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
+        if self.device.resonance
+            && let Some(remedy) = target
+                .klippy(self.computer)
+                .and_then(|klippy| crate::cli::doctor::without_numpy(self.computer, &klippy))
+        {
+            self.report.line(format_args!("SHAPER_CALIBRATE needs numpy first: {remedy}"));
+        }
+        self.report.line(format_args!("{} takes all of it back.", command(self.args, true)));
+        Ok(())
+    }
+
+    /// The sections of printer.cfg.
+    fn sections(&self, target: &Target, mcu: &str, wires: &[Wire], address: Option<u8>) -> Result<String, String> {
+        let node = self.node();
+        let mut text = self.device.named(&self.way.config, self.name()).replace("{mcu}", mcu);
+        let address =
+            address.or_else(|| self.search.addresses(self.way, &self.spot).first().copied()).unwrap_or_default();
+        let values = [
+            ("spi_bus", node.to_owned()),
+            ("i2c_bus", node.replacen('-', ".", 1)),
+            ("pwm", node.to_owned()),
+            ("uart", node.to_owned()),
+            ("address", address.to_string()),
+        ];
+        for (name, value) in values {
+            text = text.replace(&format!("{{{name}}}"), &value);
+        }
+        for wire in wires.iter().filter(|wire| is_line(&wire.role)) {
+            let line = self.board.line(wire.pin).unwrap_or_default();
+            text = text.replace(&format!("{{{}}}", wire.role), line);
+        }
+        if text.contains("{serial_no}") {
+            let serial = self.thermometer(Some(target)).ok_or(
+                "the thermometer's number is not known before it answers: boot the board with it, then call this again",
+            )?;
+            text = text.replace("{serial_no}", &serial);
+        }
+        Ok(text)
+    }
+}
+
+/// Whether a Pinion serves at this link. Klipper's own program may also have made it.
+fn serves(computer: &Computer, link: &Path) -> bool {
+    let name = link.to_str().and_then(|link| link.strip_prefix(HOST_PATHS)).unwrap_or_default();
+    let unit = if name == "mcu" { "pinion-mcu".to_owned() } else { format!("pinion-mcu@{name}") };
+    let is_its = |running: &Running| {
+        let settings = running.settings.as_ref();
+        running.unit.as_ref() == Some(&unit) || settings.is_some_and(|settings| settings.symlink == link)
+            // Pinion in the place of klipper_mcu.
+            || running.unit.as_deref().is_some_and(|unit| crate::cli::computer::units::of_klipper_mcu(unit) && name == "mcu")
+    };
+    link.exists() && computer.running().iter().any(is_its)
+}

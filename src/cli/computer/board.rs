@@ -1,0 +1,264 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The boards that are known, one file in `boards` for each: the header, its lines and buses, and how the boot loader
+//! enables the buses.
+//!
+//! To add one, write its file and name it in [`BOARDS`]. The tests check it.
+
+use std::collections::BTreeMap;
+
+use pinion_linux::foreign::word;
+use serde::Deserialize;
+
+use super::Computer;
+
+macro_rules! files {
+    ($($name:literal)*) => {
+        [$(($name, include_str!(concat!("boards/", $name, ".toml")))),*]
+    };
+}
+
+/// Each board by its name on the command line. The first one that fits counts.
+const BOARDS: [(&str, &str); 9] = files!("raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
+    "orange-pi-3-lts" "orange-pi-zero-2" "radxa-zero-3");
+
+/// A kind of connection.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq, PartialOrd, Ord)]
+#[serde(rename_all = "lowercase")]
+pub(in crate::cli) enum Kind {
+    /// SPI, with the controller's own chip select.
+    Spi,
+    /// I2C.
+    I2c,
+    /// 1-Wire.
+    W1,
+    /// The data output of an SPI controller, for LEDs.
+    Leds,
+    /// A hardware PWM channel.
+    Pwm,
+    /// A serial port.
+    Uart,
+    /// GPIO lines only.
+    Line,
+}
+
+impl Kind {
+    pub(in crate::cli) fn name(self) -> &'static str {
+        match self {
+            Kind::Spi => "SPI",
+            Kind::I2c => "I2C",
+            Kind::W1 => "1-Wire",
+            Kind::Leds => "SPI for LEDs",
+            Kind::Pwm => "hardware PWM",
+            Kind::Uart => "serial port",
+            Kind::Line => "GPIO lines",
+        }
+    }
+}
+
+/// The maker of a board's processor. It decides the names of lines.
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "lowercase")]
+pub(in crate::cli) enum Maker {
+    #[default]
+    Raspberry,
+    Allwinner,
+    Rockchip,
+}
+
+/// A board.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::cli) struct Board {
+    /// Its name on the command line, and of its file.
+    #[serde(skip)]
+    pub(in crate::cli) id: &'static str,
+    pub(in crate::cli) name: String,
+    /// The device tree's models, without the revision behind them.
+    models: Vec<String>,
+    /// A text in a file that a board with the same model does not have.
+    marker: Option<Marker>,
+    #[serde(default)]
+    pub(in crate::cli) maker: Maker,
+    pub(in crate::cli) boot: Boot,
+    /// The files with the boot loader's settings. The first one that is there counts.
+    pub(in crate::cli) files: Vec<String>,
+    /// The voltage of the lines.
+    pub(in crate::cli) level: String,
+    /// The labels of the header's pins, from pin 1 on.
+    pub(in crate::cli) pins: Vec<String>,
+    /// The name of a connector that is no header with numbered pins.
+    pub(in crate::cli) connector: Option<String>,
+    /// The lines in printer.cfg by their pin.
+    pub(in crate::cli) lines: BTreeMap<String, String>,
+    /// The pins for lines that nothing else needs, the best one first.
+    pub(in crate::cli) free: Vec<usize>,
+    /// The pins for lines that are pulled up until Pinion starts, the best one first.
+    #[serde(default)]
+    pub(in crate::cli) up: Vec<usize>,
+    /// The PWM channel of each pin that can have one.
+    #[serde(default)]
+    pub(in crate::cli) pwm: BTreeMap<String, u32>,
+    /// The functions on the header.
+    pub(in crate::cli) bus: BTreeMap<Kind, Bus>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Marker {
+    file: String,
+    text: String,
+}
+
+/// The way to enable something in a board's boot loader.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+pub(in crate::cli) enum Boot {
+    /// A Raspberry Pi's config.txt.
+    #[serde(rename = "config.txt")]
+    ConfigTxt,
+    /// `overlays=` in armbianEnv.txt, BoardEnv.txt or orangepiEnv.txt.
+    #[serde(rename = "overlays")]
+    Overlays,
+}
+
+/// A bus of a board.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::cli) struct Bus {
+    /// Its name: a node in /dev, a 1-Wire bus, a PWM channel of printer.cfg, or a serial port.
+    pub(in crate::cli) node: String,
+    /// Its pins.
+    pub(in crate::cli) pins: BTreeMap<String, usize>,
+    /// Further pins that the controller holds once it is enabled, such as its other chip selects.
+    #[serde(default)]
+    pub(in crate::cli) holds: Vec<usize>,
+    /// The lines of config.txt that enable it.
+    #[serde(default)]
+    pub(in crate::cli) enable: Vec<String>,
+    /// The overlays that enable it on different images, each with its parameters. The first one that the image has
+    /// counts.
+    #[serde(default)]
+    pub(in crate::cli) overlays: Vec<Vec<String>>,
+    /// Another chip select of the same controller.
+    also: Option<Spot>,
+}
+
+/// A place on a bus for one device.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::cli) struct Spot {
+    pub(in crate::cli) node: String,
+    pub(in crate::cli) pins: BTreeMap<String, usize>,
+}
+
+impl Bus {
+    /// Its places for devices, the best one first.
+    pub(in crate::cli) fn spots(&self) -> impl Iterator<Item = Spot> {
+        [Spot { node: self.node.clone(), pins: self.pins.clone() }].into_iter().chain(self.also.clone())
+    }
+
+    /// All pins that it has when it is enabled.
+    pub(in crate::cli) fn all_pins(&self) -> impl Iterator<Item = usize> {
+        self.spots().flat_map(|spot| spot.pins.into_values()).chain(self.holds.iter().copied())
+    }
+}
+
+/// The function of a node, which all its users share: `spi0` of `spidev0.1`, `i2c1` of `i2c-1`.
+pub(in crate::cli) fn function(node: &str) -> String {
+    match (node.strip_prefix("spidev"), node.strip_prefix("i2c-")) {
+        (Some(numbers), _) => format!("spi{}", numbers.split('.').next().unwrap_or_default()),
+        (_, Some(number)) => format!("i2c{number}"),
+        _ if node.starts_with("w1_") => "w1".to_owned(),
+        _ if node.contains(".pwm/") => "pwm".to_owned(),
+        _ => node.to_owned(),
+    }
+}
+
+/// All known boards.
+///
+/// # Errors
+///
+/// The first file with a mistake. The tests find it before a user does.
+pub(in crate::cli) fn all() -> Result<Vec<Board>, String> {
+    let board = |(id, text): (&'static str, &str)| {
+        let board: Board =
+            toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {id}.toml: {error}"))?;
+        Ok(Board { id, ..board })
+    };
+    BOARDS.into_iter().map(board).collect()
+}
+
+/// The names of the boards on the command line.
+pub(in crate::cli) const NAMES: [&str; 9] = {
+    let mut names = [""; 9];
+    let mut at = 0;
+    while at < names.len() {
+        names[at] = BOARDS[at].0;
+        at += 1;
+    }
+    names
+};
+
+impl Board {
+    /// The board that this computer is, or the one that has this name.
+    ///
+    /// # Errors
+    ///
+    /// One line: no board has the name.
+    pub(in crate::cli) fn of(computer: &Computer, named: Option<&str>) -> Result<Option<Board>, String> {
+        let mut boards = all()?.into_iter();
+        match named {
+            Some(name) => match boards.find(|board| board.id == name) {
+                Some(board) => Ok(Some(board)),
+                None => Err(format!("--board: there is no board \"{name}\": choose one of {}", NAMES.join(", "))),
+            },
+            None => Ok(boards.find(|board| board.is_here(computer))),
+        }
+    }
+
+    fn is_here(&self, computer: &Computer) -> bool {
+        let is_marked = self.marker.as_ref().is_none_or(|marker| {
+            let text = computer.text(&marker.file).unwrap_or_default();
+            text.lines().any(|line| line.split('#').next().unwrap_or_default().trim() == marker.text)
+        });
+        let model = model(computer);
+        // Raspberry Pi's firmware adds the revision. A name that only begins like this is another board's.
+        let model = model.split(" Rev ").next().unwrap_or_default();
+        is_marked && self.models.iter().any(|name| name == model)
+    }
+
+    /// The line of a pin, as printer.cfg writes it.
+    pub(in crate::cli) fn line(&self, pin: usize) -> Option<&str> {
+        self.lines.get(&pin.to_string()).map(String::as_str)
+    }
+
+    /// The label of a pin.
+    pub(in crate::cli) fn label(&self, pin: usize) -> &str {
+        pin.checked_sub(1).and_then(|at| self.pins.get(at)).map_or("", String::as_str)
+    }
+
+    /// The first word of a pin's label: on a Raspberry Pi the line's name, and with others the maker's name.
+    pub(in crate::cli) fn line_label(&self, pin: usize) -> &str {
+        self.label(pin).split(' ').next().unwrap_or_default()
+    }
+}
+
+/// The device tree's model.
+pub(in crate::cli) fn model(computer: &Computer) -> String {
+    computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
+}
+
+/// Whether this is a Raspberry Pi.
+pub(in crate::cli) fn is_pi(computer: &Computer) -> bool {
+    model(computer).contains("Raspberry Pi")
+}
+
+/// A Raspberry Pi's config.txt.
+pub(in crate::cli) fn pi_config(computer: &Computer) -> Option<&'static str> {
+    computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
+}
+
+/// The command that adds these lines to a Raspberry Pi's config.txt. The file's last line may have no end.
+pub(in crate::cli) fn append(computer: &Computer, lines: &str) -> String {
+    let config = pi_config(computer).map_or_else(|| "/boot/firmware/config.txt".into(), |config| computer.path(config));
+    format!("printf '\\n[all]\\n{lines}\\n' | sudo tee -a {}", word(config.display()))
+}
