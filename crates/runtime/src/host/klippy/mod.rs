@@ -261,6 +261,8 @@ mod tests {
             assert!(checkout.shapes.len() <= 10_000 && checkout.shapes.iter().all(|shape| shape.as_str().len() < 1000));
             let missing = checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES);
             assert!(names(&missing).len() < 11_000, "a line of the log");
+            let is_told = checkout.unread.as_ref().is_some_and(|unread| unread.contains("has too many messages"));
+            assert_eq!(is_told, checkout.shapes.len() == 10_000, "what was left out may be the host's");
             assert!(checkout.forms.places().count() <= entries(FEATURES).len());
         }
     }
