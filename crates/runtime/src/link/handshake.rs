@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dictionary for a new host: its forms of messages, and the board's present devices. The host's first bytes wait for
-//! that.
+//! Finds the dictionary for a new host: its forms of messages, and the board's present devices. The host's first bytes
+//! wait for that.
 
 use std::path::Path;
 use std::sync::Arc;
