@@ -351,15 +351,15 @@ impl Object for I2c {
                     }
                 }
                 Err(error) => match answers.repeat(transfer, context.now()) {
-                    Some(since) => {
-                        if tolerance.bears(context, KIND, since, |context| i2c_shutdown(context, error.clone())) {
-                            result = Ok(());
-                        }
+                    Some(since)
+                        if tolerance.bears(context, KIND, since, |context| i2c_shutdown(context, error.clone())) =>
+                    {
+                        result = Ok(());
                     }
                     None if transfer.read_len == 0 || transfer.is_change() => {
                         error.trouble.remedy = Some("tolerate is only for a device that is read".into());
                     }
-                    None => {}
+                    _ => {}
                 },
             }
         }
