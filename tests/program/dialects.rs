@@ -8,6 +8,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use pinion_client::config::Config;
 use pinion_testkit::process::Running;
 use pinion_testkit::{here, wait};
@@ -242,6 +244,25 @@ fn a_new_process_of_the_host_finds_a_fresh_mcu_and_the_same_one_does_not() {
     until_once_more(&pinion, "host gone", || drop(other));
     host.turn("open");
     assert!(is_shutdown(&pinion), "the host of before");
+}
+
+/// Somebody writes FORCE_SHUTDOWN while the search still looks at the new host.
+#[test]
+fn a_new_process_of_the_host_sees_a_stop_that_came_after_it() {
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("master");
+    let host = Host::start(&pinion, &checkout);
+    let client = pinion.configured(&["config_analog_in oid=0 pin=bed_sensor"]);
+    until_once_more(&pinion, "host gone", || drop((client, host)));
+    let search = Pid::from_raw(search_of(pinion.pid()).unwrap() as i32);
+    kill(search, Signal::SIGSTOP).unwrap();
+    let host = Host::start(&pinion, &checkout);
+    until_once_more(&pinion, "FORCE_SHUTDOWN was written", || {
+        fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
+        kill(search, Signal::SIGCONT).unwrap();
+    });
+    assert!(is_shutdown(&pinion), "{}", pinion.log());
+    drop(host);
 }
 
 #[test]

@@ -85,6 +85,8 @@ struct Ds18b20 {
     /// Whether a reading has succeeded.
     has_value: bool,
     tolerance: Option<Tolerance>,
+    /// When the first failure came since the last success.
+    failing_since: Option<Clock>,
 }
 
 const KIND: &str = "DS18B20";
@@ -139,6 +141,7 @@ impl Object for Ds18b20 {
                 self.value = value;
                 self.error_count = 0;
                 self.has_value = true;
+                self.failing_since = None;
                 if let Some(tolerance) = &mut self.tolerance {
                     tolerance.works(context, KIND, READ_FAILED);
                 }
@@ -146,7 +149,8 @@ impl Object for Ds18b20 {
             Err(trouble)
                 if self.has_value
                     && self.tolerance.as_mut().is_some_and(|tolerance| {
-                        tolerance.bears(context, KIND, |_| Shutdown::because(READ_FAILED, trouble.clone()))
+                        let since = *self.failing_since.get_or_insert(context.now());
+                        tolerance.bears(context, KIND, since, |_| Shutdown::because(READ_FAILED, trouble.clone()))
                     }) => {}
             Err(trouble) => {
                 self.error_count = self.error_count.saturating_add(1);
@@ -198,6 +202,7 @@ fn configure(
         value: 0,
         has_value: false,
         tolerance: context.tolerance(&Device::OneWire(String::from_utf8_lossy(serial).into_owned())),
+        failing_since: None,
     };
     context.assign(oid, sensor)
 }

@@ -14,7 +14,7 @@ use crate::mcu::{
     Report, Response, Tolerance, command, response,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
-use crate::time::{CLOCK_FREQ, Ticks};
+use crate::time::{CLOCK_FREQ, Clock, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -143,6 +143,17 @@ impl Transfer {
         Transfer { purpose, writes_back: false, write: bytes, write_len, read: [0; u8::MAX as usize], read_len }
     }
 
+    /// The bytes that select the answer. Of a write, only the register or command: its data may differ each time.
+    fn question(&self) -> &[u8] {
+        let len = if self.read_len == 0 { self.write_len.min(1) } else { self.write_len };
+        &self.write[..len]
+    }
+
+    /// Whether it changes what the device holds, by what it reads: an expander's outputs.
+    fn is_change(&self) -> bool {
+        matches!(self.purpose, Purpose::Modify { .. })
+    }
+
     /// The bytes for which the answer has room, as in Klipper's C.
     fn response(&self) -> &[u8] {
         &self.read[..self.read_len.min(RESPONSE_MAX)]
@@ -188,14 +199,16 @@ pub(super) struct I2c {
 }
 
 /// The last answers of a device, to be repeated while it fails.
-#[derive(Default)]
 struct Answers(Vec<Answer>);
 
 struct Answer {
-    write: [u8; PAYLOAD_MAX],
-    write_len: usize,
+    question: [u8; PAYLOAD_MAX],
+    question_len: usize,
     read: [u8; u8::MAX as usize],
+    /// 0: the question is a write.
     read_len: usize,
+    /// When the question first failed since its last answer.
+    failing_since: Option<Clock>,
 }
 
 impl Answers {
@@ -206,38 +219,53 @@ impl Answers {
         Answers(Vec::with_capacity(Answers::MAX))
     }
 
-    fn place(&self, transfer: &Transfer) -> Option<usize> {
-        let written = &transfer.write[..transfer.write_len];
-        self.0
-            .iter()
-            .position(|answer| answer.read_len == transfer.read_len && &answer.write[..answer.write_len] == written)
+    fn of(&mut self, transfer: &Transfer) -> Option<&mut Answer> {
+        let same = |answer: &&mut Answer| {
+            answer.read_len == transfer.read_len && &answer.question[..answer.question_len] == transfer.question()
+        };
+        self.0.iter_mut().find(same)
     }
 
-    /// Keeps an answer. Of too many different ones, the oldest is forgotten.
+    /// The answer to this question, made if it is new. Of too many, the oldest one that does not fail is forgotten.
+    fn of_any(&mut self, transfer: &Transfer) -> Option<&mut Answer> {
+        if self.of(transfer).is_none() {
+            if self.0.len() == Answers::MAX {
+                self.0.remove(self.0.iter().position(|answer| answer.failing_since.is_none())?);
+            }
+            let Transfer { write, read, read_len, .. } = *transfer;
+            let question_len = transfer.question().len();
+            self.0.push(Answer { question: write, question_len, read, read_len, failing_since: None });
+        }
+        self.of(transfer)
+    }
+
+    /// Keeps an answer. The question fails no more.
     fn keep(&mut self, transfer: &Transfer) {
-        if transfer.read_len == 0 {
+        if transfer.is_change() {
             return;
         }
-        let Transfer { write, write_len, read, read_len, .. } = *transfer;
-        if let Some(place) = self.place(transfer) {
-            self.0[place].read = read;
-            return;
+        if let Some(answer) = self.of_any(transfer) {
+            answer.read = transfer.read;
+            answer.failing_since = None;
         }
-        if self.0.len() == Answers::MAX {
-            self.0.remove(0);
-        }
-        self.0.push(Answer { write, write_len, read, read_len });
     }
 
-    /// Repeats the last answer to this question. False if there is none. A write to a device that is read has nothing
-    /// to repeat.
-    fn repeat(&self, transfer: &mut Transfer) -> bool {
-        match self.place(transfer) {
-            Some(place) => transfer.read = self.0[place].read,
-            None if transfer.read_len == 0 && !self.0.is_empty() => {}
-            None => return false,
-        }
-        true
+    /// Repeats the last answer to this question, and returns when it first failed. `None` if there is no answer, or if
+    /// the device is written and not read. A write to a device that is read has nothing to repeat.
+    fn repeat(&mut self, transfer: &mut Transfer, now: Clock) -> Option<Clock> {
+        let is_read = self.0.iter().any(|answer| answer.read_len > 0);
+        let answer = match transfer.read_len {
+            _ if transfer.is_change() => return None,
+            0 if is_read => self.of_any(transfer)?,
+            0 => return None,
+            _ => self.of(transfer)?,
+        };
+        transfer.read = answer.read;
+        Some(*answer.failing_since.get_or_insert(now))
+    }
+
+    fn is_failing(&self) -> bool {
+        self.0.iter().any(|answer| answer.failing_since.is_some())
     }
 }
 
@@ -318,16 +346,21 @@ impl Object for I2c {
             match &mut result {
                 Ok(()) => {
                     answers.keep(transfer);
-                    tolerance.works(context, KIND, I2C_NACK);
-                }
-                Err(error) if !answers.repeat(transfer) => {
-                    error.trouble.remedy = Some("tolerate is only for a device that is read".into());
-                }
-                Err(error) => {
-                    if tolerance.bears(context, KIND, |context| i2c_shutdown(context, error.clone())) {
-                        result = Ok(());
+                    if !answers.is_failing() {
+                        tolerance.works(context, KIND, I2C_NACK);
                     }
                 }
+                Err(error) => match answers.repeat(transfer, context.now()) {
+                    Some(since)
+                        if tolerance.bears(context, KIND, since, |context| i2c_shutdown(context, error.clone())) =>
+                    {
+                        result = Ok(());
+                    }
+                    None if transfer.read_len == 0 || transfer.is_change() => {
+                        error.trouble.remedy = Some("tolerate is only for a device that is read".into());
+                    }
+                    _ => {}
+                },
             }
         }
         let response = transfer.response();

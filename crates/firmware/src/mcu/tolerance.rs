@@ -71,25 +71,34 @@ pub type Tolerances = Vec<(Device, Limit)>;
 /// The tolerance for one device.
 pub struct Tolerance {
     limit: Limit,
-    /// When the first failure of a row came.
+    /// When the first failure came that is not over.
     since: Option<Clock>,
 }
 
 impl Tolerance {
-    /// The device works. Logs the end of a tolerated failure.
+    /// Each question to the device is answered again. Logs the end of a tolerated failure.
     pub fn works(&mut self, context: &mut Context, kind: &str, reason: ShutdownReason) {
         let Some(since) = self.since.take() else { return };
         let ms = context.now().since(since) / i64::from(CLOCK_FREQ / 1000);
         context.warn(kind, Shutdown::because(reason, format!("it answers again, after {ms} ms")));
     }
 
-    /// Whether this failure is tolerated: the first one of a row was not too long ago. Logs the first one.
-    pub fn bears(&mut self, context: &mut Context, kind: &str, failure: impl FnOnce(&Context) -> Shutdown) -> bool {
-        let now = context.now();
-        if let Some(since) = self.since {
-            return now.since(since) <= i64::from(self.limit.0) * i64::from(CLOCK_FREQ);
+    /// Whether this failure is tolerated. `since` is when its question first failed. Other questions may have answers,
+    /// so each question has a time of its own. Logs the first failure of the device.
+    pub fn bears(
+        &mut self,
+        context: &mut Context,
+        kind: &str,
+        since: Clock,
+        failure: impl FnOnce(&Context) -> Shutdown,
+    ) -> bool {
+        if context.now().since(since) > i64::from(self.limit.0) * i64::from(CLOCK_FREQ) {
+            return false;
         }
-        self.since = Some(now);
+        if self.since.is_some() {
+            return true;
+        }
+        self.since = Some(since);
         let failure = failure(context);
         let mut trouble = failure.trouble.clone();
         trouble.cause =

@@ -87,6 +87,61 @@ fn a_question_without_an_answer_and_a_device_that_is_not_read_stop_the_mcu() {
     read(&mut rig);
     fails.store(true, Ordering::Relaxed);
     rig.stops_on("i2c_read oid=0 reg=11 read_len=2", "I2C START NACK");
+    // It is read: the tolerance is not to blame.
+    assert!(!rig.notes().last().unwrap().contains("tolerate"), "{:?}", rig.notes());
+}
+
+/// Hosts before v0.13 set an expander's outputs by this command.
+#[test]
+fn a_change_of_bits_is_a_write_although_it_reads() {
+    const CHANGE: &str = "i2c_modify_bits oid=0 reg=10 clear_set_bits=0f01";
+    let mut rig = Rig::of(DialectName::V0_12);
+    rig.mcu.tolerate(tolerances(&[("i2c.1/0x48", "30s")]));
+    rig.configure(DEVICE);
+    let fails = Arc::new(AtomicBool::new(false));
+    let flag = fails.clone();
+    rig.bench.plug_i2c(1, 0x48, move |_, _, _| match flag.load(Ordering::Relaxed) {
+        true => Err(BusStatus::StartNack),
+        false => Ok(()),
+    });
+    rig.send(CHANGE);
+    fails.store(true, Ordering::Relaxed);
+    rig.stops_on(CHANGE, "Unable to read i2c device");
+    assert!(rig.notes().last().unwrap().contains("tolerate is only for a device that is read"), "{:?}", rig.notes());
+}
+
+/// Klippy reads several registers. Some chips accept a command and never answer the read that follows.
+#[test]
+fn a_failure_ends_in_time_although_other_questions_are_answered() {
+    const READ: &str = "i2c_read oid=0 reg=10 read_len=2";
+    const WRITE: &str = "i2c_write oid=0 data=3040";
+    for (failing, working) in [(READ, WRITE), (WRITE, READ), (READ, "i2c_read oid=0 reg=20 read_len=1")] {
+        let mut rig = Rig::of(DialectName::V0_13);
+        rig.mcu.tolerate(tolerances(&[("i2c.1/0x48", "2s")]));
+        rig.configure(DEVICE);
+        let fails = Arc::new(AtomicBool::new(false));
+        let flag = fails.clone();
+        let question = |command: &str| (command.contains("read"), command.contains("=10"));
+        rig.bench.plug_i2c(1, 0x48, move |_, written, read| {
+            let asked = (!read.is_empty(), written == [0x10]);
+            if flag.load(Ordering::Relaxed) && asked == question(failing) {
+                return Err(BusStatus::StartNack);
+            }
+            read.fill(1);
+            Ok(())
+        });
+        rig.send_all(&[READ, WRITE, working]);
+        fails.store(true, Ordering::Relaxed);
+        for ms in [100, 1100, 2100] {
+            rig.run_until(ms * MS);
+            rig.send_all(&[failing, working]);
+        }
+        assert_eq!(rig.shutdown(), None, "{failing}");
+        let warnings = rig.notes().iter().filter(|note| note.starts_with("warning: ")).count();
+        assert_eq!(warnings, 1, "{:?}", rig.notes());
+        rig.run_until(2200 * MS);
+        rig.stops_on(failing, "I2C START NACK");
+    }
 }
 
 #[test]

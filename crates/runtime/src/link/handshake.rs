@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dictionary for a new host: its forms of messages, and the board's present devices. The host's first bytes wait for
-//! that.
+//! Finds the dictionary for a new host: its forms of messages, and the board's present devices. The host's first bytes
+//! wait for that.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -42,6 +42,8 @@ pub(crate) struct Handshake {
     is_finding: bool,
     /// The bytes have waited too long, and the answer is still missing.
     is_overdue: bool,
+    /// Somebody stopped the MCU since the host came, so the host has to see that.
+    is_stopped: bool,
 }
 
 /// The state of a handshake.
@@ -79,7 +81,16 @@ impl Handshake {
     /// Every host speaks this dialect, and the board never changes.
     pub(crate) fn of(first: Arc<Dialect>) -> Handshake {
         let kept = vec![first.clone()];
-        Handshake { first, kept, finder: None, surveyor: None, until: None, is_finding: false, is_overdue: false }
+        Handshake {
+            first,
+            kept,
+            finder: None,
+            surveyor: None,
+            until: None,
+            is_finding: false,
+            is_overdue: false,
+            is_stopped: false,
+        }
     }
 
     /// The dialect that is spoken before a host comes.
@@ -91,12 +102,18 @@ impl Handshake {
     pub(crate) fn begin(&mut self, terminal: Option<&Path>) {
         let Some(surveyor) = &mut self.surveyor else { return };
         surveyor.look();
+        self.is_stopped = false;
         self.until = Some(monotonic() + FIND_LIMIT);
         if let Some(finder) = &mut self.finder {
             finder.ask(terminal);
             self.is_finding = true;
             self.is_overdue = false;
         }
+    }
+
+    /// Somebody stops the MCU. The present host is to see that, even if it is another than before.
+    pub(crate) fn stop(&mut self) {
+        self.is_stopped = true;
     }
 
     /// The host is gone.
@@ -115,7 +132,7 @@ impl Handshake {
         {
             self.is_finding = false;
             surveyor.make(forms);
-            if is_other {
+            if is_other && !self.is_stopped {
                 return Step::Renew;
             }
         }

@@ -317,6 +317,7 @@ impl LinkThread {
             self.record(Event::Alive);
         }
         if read.is_forced {
+            self.handshake.stop();
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
             self.request(Request::Shutdown(stop.remedy("FIRMWARE_RESTART starts anew")));
         }

@@ -257,10 +257,19 @@ mod tests {
             fs::copy(more.join("extras/all.py"), klippy.join("extras/hostile.py")).unwrap();
             fs::create_dir(folder.path().join("src")).unwrap();
             fs::copy(more.join("extras/all.py"), folder.path().join("src/hostile.c")).unwrap();
-            let Ok(checkout) = Checkout::read(&klippy, FEATURES) else { continue };
+            let checkout = match Checkout::read(&klippy, FEATURES) {
+                Ok(checkout) => checkout,
+                // The hostile file was read first.
+                Err(error) => {
+                    assert!(error.to_string().contains("has too many messages"), "{error}");
+                    continue;
+                }
+            };
             assert!(checkout.shapes.len() <= 10_000 && checkout.shapes.iter().all(|shape| shape.as_str().len() < 1000));
             let missing = checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES);
             assert!(names(&missing).len() < 11_000, "a line of the log");
+            let is_told = checkout.unread.as_ref().is_some_and(|unread| unread.contains("has too many messages"));
+            assert_eq!(is_told, checkout.shapes.len() == 10_000, "what was left out may be the host's");
             assert!(checkout.forms.places().count() <= entries(FEATURES).len());
         }
     }

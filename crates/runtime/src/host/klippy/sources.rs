@@ -208,6 +208,9 @@ impl Sources {
                 Some(shape) if self.shapes.len() < SHAPES_MAX => {
                     self.shapes.insert(shape);
                 }
+                Some(shape) if !self.shapes.contains(&shape) => {
+                    self.unread.get_or_insert_with(|| format!("{} has too many messages", path.display()));
+                }
                 None if is_wanted(string) => {
                     self.words.insert(string.to_owned());
                 }

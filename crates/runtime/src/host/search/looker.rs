@@ -109,9 +109,11 @@ struct Looker {
     /// The host that was seen last. A process continues with the sources that it has loaded, even if the files change.
     /// klippy's RESTART keeps the process. A host whose sources could not be read is inspected again.
     last: Option<(Process, HostForms)>,
-    /// The process that had the terminal open before, as long as it lives. `None` if nobody knows.
-    before: Option<Process>,
-    /// That process is gone, and the present one is another.
+    /// The processes that had the terminal open and may still live. Each may have configured the MCU.
+    hosts: Vec<Process>,
+    /// A process had the terminal open that could not be found.
+    missed_one: bool,
+    /// All former hosts are gone, and the present one is another.
     is_other: bool,
     /// The same host, for the status.
     host: Option<FoundHost>,
@@ -119,13 +121,15 @@ struct Looker {
 }
 
 impl Looker {
-    /// Notes whether the process that has the terminal open is another than before. A process that only looks in while
-    /// the host lives is none.
+    /// Notes whether every process that had the terminal open before is gone. A process that was not found may live.
     fn meet(&mut self, process: &Process) {
-        let is_gone = self.before.as_ref().map(is_gone);
-        self.is_other = is_gone == Some(true);
-        if is_gone != Some(false) {
-            self.before = Some(process.clone());
+        let is_new = !self.hosts.iter().any(|host| is_same(host, process));
+        let had_host = !self.hosts.is_empty();
+        self.hosts.retain(|host| !is_gone(host));
+        self.is_other = had_host && self.hosts.is_empty() && !self.missed_one;
+        self.missed_one = false;
+        if is_new {
+            self.hosts.push(Process { arguments: Vec::new(), ..*process });
         }
     }
 
@@ -136,7 +140,7 @@ impl Looker {
         let search = find(Path::new(PROC), terminal);
         match &search {
             Ok(Search::Found(process)) => self.meet(process),
-            _ => self.before = None,
+            _ => self.missed_one = true,
         }
         let say = &mut self.say;
         let (process, is_sure) = match search {
@@ -263,4 +267,66 @@ fn started(process: &Process) -> Option<SystemTime> {
     let per_s = u64::try_from(sysconf(SysconfVar::CLK_TCK).ok()??).ok()?;
     // One second is for the rounding of the boot time.
     Some(SystemTime::UNIX_EPOCH + Duration::from_secs(boot_s + process.started / per_s.max(1) + 1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::{Child, Command, Stdio};
+
+    /// Another process that looks in, and lives until it is killed.
+    fn guest() -> (Child, Process) {
+        let guest = Command::new("cat").stdin(Stdio::piped()).spawn().unwrap();
+        // For a moment a process that has become another program has no command line yet.
+        loop {
+            match process::of(Path::new(PROC), guest.id()) {
+                Some(process) if !process.arguments.is_empty() => return (guest, process),
+                _ => std::thread::yield_now(),
+            }
+        }
+    }
+
+    fn end((mut guest, _): (Child, Process)) {
+        guest.kill().unwrap();
+        guest.wait().unwrap();
+    }
+
+    fn is_other(looker: &mut Looker, process: &Process) -> bool {
+        looker.meet(process);
+        looker.is_other
+    }
+
+    #[test]
+    fn a_host_is_another_one_when_all_before_it_are_gone() {
+        let mut looker = Looker::default();
+        let (klippy, next) = (guest(), guest());
+        assert!(!is_other(&mut looker, &klippy.1) && !is_other(&mut looker, &klippy.1));
+        assert!(!is_other(&mut looker, &next.1), "klippy lives");
+        end(next);
+        assert!(!is_other(&mut looker, &klippy.1));
+        end(klippy);
+        let next = guest();
+        assert!(is_other(&mut looker, &next.1) && !is_other(&mut looker, &next.1));
+        end(next);
+    }
+
+    #[test]
+    fn a_klippy_that_lives_is_not_another_one_after_a_guest_or_an_unknown_process() {
+        let (klippy, early, late) = (guest(), guest(), guest());
+        let mut looker = Looker::default();
+        // The guest had the terminal open before klippy came.
+        assert!(!is_other(&mut looker, &early.1) && !is_other(&mut looker, &klippy.1));
+        end(early);
+        assert!(!is_other(&mut looker, &klippy.1));
+        looker.missed_one = true;
+        assert!(!is_other(&mut looker, &late.1));
+        end(late);
+        assert!(!is_other(&mut looker, &klippy.1));
+        // A process that was not found may have configured the MCU, and may live.
+        end(klippy);
+        looker.missed_one = true;
+        let next = guest();
+        assert!(!is_other(&mut looker, &next.1));
+        end(next);
+    }
 }
