@@ -126,7 +126,7 @@ impl Handshake {
                 return self.speak(spoken);
             }
         }
-        let Some(finder) = &self.finder else {
+        let Some(finder) = &mut self.finder else {
             self.until = None;
             return Step::Done;
         };
@@ -152,7 +152,7 @@ impl Handshake {
 
     /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
-        let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
+        let answer = self.finder.as_mut().filter(|_| self.is_overdue).and_then(HostFinder::answer);
         let Some(name) = answer else { return };
         self.is_overdue = false;
         if name != DialectName::Union {

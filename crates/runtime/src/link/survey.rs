@@ -73,6 +73,11 @@ impl Surveyor {
 
     /// Asks for the board's present devices.
     pub(crate) fn ask(&mut self) {
+        // A host may come and go at any rate. A question behind the first one is not begun yet, so its answer is new.
+        let _ = self.is_done();
+        if self.pending > 1 {
+            return;
+        }
         // The thread ends only with its questions.
         self.pending += usize::from(self.asks.send(()).is_ok());
     }
