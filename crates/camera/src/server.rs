@@ -324,7 +324,9 @@ impl Connection {
                 Ok(0) if length == 0 => return Ok(None),
                 Ok(0) => return Ok(Some(Err(BAD_REQUEST))),
                 Ok(count) => length += count,
-                Err(error) if [io::ErrorKind::Interrupted, io::ErrorKind::WouldBlock].contains(&error.kind()) => continue,
+                Err(error) if [io::ErrorKind::Interrupted, io::ErrorKind::WouldBlock].contains(&error.kind()) => {
+                    continue;
+                }
                 Err(error) => return Err(error),
             }
             match parse(&bytes[..length]) {

@@ -182,8 +182,7 @@ mod tests {
     fn of_many_hosts_that_come_and_go_only_the_last_one_waits_for_an_answer() {
         let (socket, search) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::empty()).unwrap();
         let wake = Arc::new(LinkWake::new().unwrap());
-        let mut finder =
-            HostFinder::start(HostSearch(socket), Path::new("/dev/null"), wake, Arc::default()).unwrap();
+        let mut finder = HostFinder::start(HostSearch(socket), Path::new("/dev/null"), wake, Arc::default()).unwrap();
         (0..1000).for_each(|_| finder.ask(None));
         let mut message = vec![0; MESSAGE_BYTES_MAX];
         let mut number = || {
