@@ -149,8 +149,10 @@ SUITES ?= bookworm trixie
 test-bare:
 	@for suite in $(SUITES); do scripts/bare $$suite || exit 1; done
 
+# Such as '--skip page' or 'upgrade' (docs/develop/test-package.md).
+CHECKS ?=
 test-package: system-packages-system
-	'$(CARGO)' test --locked --test package
+	'$(CARGO)' test --locked --test package -- $(CHECKS)
 
 SECONDS ?= 86400
 # Each run has its own faults. The test prints its seed if it fails.

@@ -81,7 +81,7 @@ fn board(settings: &Settings, simulated: Open) -> Vec<Finding> {
     findings.push(match Dialect::new(&FIRMWARE, &*board, name) {
         Ok(_) => match settings.dialect {
             Some(name) => Finding::ok("dialect", format!("dialect {name}")),
-            None => Finding::ok("dialect", "dialect of whichever host comes"),
+            None => Finding::ok("dialect", "messages of whichever host comes"),
         },
         Err(error) => Finding::error("dialect", format!("dialect {name}: {error}"), "choose another"),
     });

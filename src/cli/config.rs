@@ -9,6 +9,7 @@ use std::str::FromStr;
 
 use toml::de::{DeTable, DeValue};
 
+use pinion_firmware::mcu::Tolerances;
 use pinion_firmware::trouble::Trouble;
 
 use super::files;
@@ -52,7 +53,7 @@ fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
 }
 
 /// Every option of `pinion run`, in the order of its `--help`.
-const KEYS: [Key; 14] = [
+const KEYS: [Key; 15] = [
     Key {
         name: "symlink",
         example: "\"/tmp/klipper_host_mcu\"",
@@ -79,6 +80,11 @@ const KEYS: [Key; 14] = [
     Key { name: "board", example: "\"linux\"", set: |given, value| put(&mut given.board, word(value)?) },
     Key { name: "dialect", example: "\"auto\"", set: |given, value| put(&mut given.dialect, word(value)?) },
     Key { name: "fast_gpio", example: "\"auto\"", set: |given, value| put(&mut given.fast_gpio, word(value)?) },
+    Key {
+        name: "tolerate",
+        example: "{ \"i2c.1/0x76\" = \"30s\" }",
+        set: |given, value| put(&mut given.tolerances, tolerances(value)?),
+    },
     Key { name: "trace_edges", example: "true", set: |given, value| put(&mut given.trace_edges, flag(value)?) },
     Key {
         name: "socket",
@@ -118,6 +124,16 @@ fn number<N: FromStr>(value: &DeValue<'_>) -> Result<N, Option<String>> {
 
 fn word<T: FromStr<Err = String>>(value: &DeValue<'_>) -> Result<T, Option<String>> {
     text(value)?.parse().map_err(Some)
+}
+
+/// Devices, each with a time.
+fn tolerances(value: &DeValue<'_>) -> Result<Tolerances, Option<String>> {
+    let table = value.as_table().ok_or(None)?;
+    let one = |(device, limit): (&toml::Spanned<std::borrow::Cow<'_, str>>, &toml::Spanned<DeValue<'_>>)| {
+        let device = device.get_ref().parse().map_err(|why| Some(format!("{}: {why}", device.get_ref())))?;
+        Ok((device, word(limit.get_ref())?))
+    };
+    table.iter().map(one).collect()
 }
 
 /// Reads the file.
@@ -230,6 +246,7 @@ mod tests {
         let mut given = parse(&settings.join("\n"), &"").unwrap();
         // These have no default that could be written down: any processor, and "tty if that is permitted".
         assert_eq!((given.cpu.take(), given.group.take().as_deref()), (Some(3), Some("tty")));
+        assert_eq!(given.tolerances.take().unwrap().len(), 2);
         // These are the service's own.
         assert_eq!(given.realtime.take(), Some(true));
         assert_eq!(given.link.take().unwrap().to_string(), "pty:/run/pinion/klipper_host_mcu");

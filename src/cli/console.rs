@@ -168,6 +168,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
         cpu: None,
         margin: MarginLimits::default(),
         watchdog: None,
+        tolerances: Vec::new(),
         trace_edges: false,
         sockets: Vec::new(),
     };

@@ -48,6 +48,7 @@ impl Settings {
             cpu: self.cpu,
             margin: MarginLimits::up_to_us(self.margin_us),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
+            tolerances: self.tolerances.clone(),
             trace_edges: self.trace_edges,
             sockets: self.socket.clone().map_or_else(|| pinion_runtime::socket_paths(&self.symlink), |path| vec![path]),
         }

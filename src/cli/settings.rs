@@ -9,7 +9,7 @@ use clap::{Args, ValueHint};
 use log::LevelFilter;
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::DialectName;
+use pinion_firmware::mcu::{DialectName, Tolerances};
 use pinion_firmware::time::{TimeSource, Timing};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::gpio::FastGpio;
@@ -70,6 +70,9 @@ pub(super) struct Given {
     /// Let the flight recorder note each edge of each output, for `pinion trace --vcd`. It costs time
     #[arg(long, num_args = 0, default_missing_value = "true")]
     pub(super) trace_edges: Option<bool>,
+    /// Only the configuration file has this.
+    #[arg(skip)]
+    pub(super) tolerances: Option<Tolerances>,
     /// Path of the socket for `pinion status` [default: named after the link, in /run/pinion or beside the link]
     #[arg(long, value_name = "PATH")]
     pub(super) socket: Option<PathBuf>,
@@ -92,6 +95,7 @@ pub(super) struct Settings {
     pub(super) board: BoardName,
     pub(super) dialect: Option<DialectName>,
     pub(super) fast_gpio: FastGpio,
+    pub(super) tolerances: Tolerances,
     pub(super) trace_edges: bool,
     pub(super) socket: Option<PathBuf>,
     pub(super) log_level: LevelFilter,
@@ -112,6 +116,7 @@ impl Given {
             board: self.board.or(other.board),
             dialect: self.dialect.or(other.dialect),
             fast_gpio: self.fast_gpio.or(other.fast_gpio),
+            tolerances: self.tolerances.or(other.tolerances),
             trace_edges: self.trace_edges.or(other.trace_edges),
             socket: self.socket.or(other.socket),
             log_level: self.log_level.or(other.log_level),
@@ -135,6 +140,7 @@ impl Given {
             board: self.board.unwrap_or(BoardName::Linux),
             dialect: self.dialect.and_then(|Spoken(name)| name),
             fast_gpio: self.fast_gpio.unwrap_or_default(),
+            tolerances: self.tolerances.unwrap_or_default(),
             trace_edges: self.trace_edges.unwrap_or(false),
             socket: self.socket,
             log_level: self.log_level.unwrap_or(LevelFilter::Info),

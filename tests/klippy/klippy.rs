@@ -157,6 +157,7 @@ impl Printer {
                 cpu: None,
                 margin: MarginLimits::default(),
                 watchdog: None,
+                tolerances: Vec::new(),
                 trace_edges: false,
                 sockets: Vec::new(),
                 dialect: None,

@@ -14,6 +14,8 @@ mod klippy;
 mod leveling;
 mod links;
 mod mainsail;
+mod months;
+mod non_critical;
 mod own_printer;
 mod print;
 mod printer_cfg;

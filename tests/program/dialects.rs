@@ -99,9 +99,9 @@ fn each_host_gets_the_dictionary_of_its_dialect() {
         let wanted = if dialect == "master" { MANY_VALUES } else { ONE_VALUE };
         assert!(commands.contains_key(wanted), "{dialect}: {commands:?}");
         assert_eq!(commands.contains_key("config_lis2dw oid=%c spi_oid=%c"), dialect == "v0.12");
-        let line = pinion.logged(&format!("dialect {dialect}, which has "));
         let folder = checkout.0.path().to_str().unwrap();
-        assert!(line.contains(&format!("the host is klippy of {folder}, process {}", host.0.0.id())), "{line}");
+        let line = pinion.logged(&format!("the host is klippy of {folder}, process {}", host.0.0.id()));
+        assert!(line.contains(": it gets each message that it looks up (found in "), "{line}");
         until_once_more(&pinion, "host gone", || drop((client, host)));
     }
 }
@@ -140,7 +140,7 @@ fn a_host_that_is_named_for_mischief_gets_its_dialect_and_no_line_of_its_own() {
     let _host = Host::start(&pinion, &checkout);
     assert!(pinion.client().dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c"));
     let line = pinion.logged("the host is klippy of ");
-    assert!(line.contains("/x?<0>forged?[2J?31m?") && line.contains("dialect v0.12, which"), "{line}");
+    assert!(line.contains("/x?<0>forged?[2J?31m?") && line.contains("it gets each message"), "{line}");
     let log = pinion.log();
     assert!(!log.contains(|c: char| c.is_control() && c != '\n'), "{log:?}");
     assert!(!log.lines().any(|line| line.starts_with("<0>")), "{log:?}");
@@ -202,7 +202,46 @@ fn a_process_goes_on_with_the_sources_that_it_has_loaded() {
     checkout.change("master", |sources| sources);
     host.turn("open");
     assert!(pinion.client().dictionary().commands.contains_key(ONE_VALUE));
-    pinion.logged(&format!("the host is the one of before, process {}: dialect v0.13", host.0.0.id()));
+    pinion.logged(&format!("the host is the one of before, process {}", host.0.0.id()));
+}
+
+/// Configures the MCU, and stops it.
+fn configure_and_stop(pinion: &Pinion) {
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
+    config.apply(&mut client).unwrap();
+    until_once_more(pinion, "shutdown: ", || client.send_line("emergency_stop").unwrap());
+}
+
+fn is_shutdown(pinion: &Pinion) -> bool {
+    pinion.client().status().unwrap().is_shutdown
+}
+
+#[test]
+fn a_new_process_of_the_host_finds_a_fresh_mcu_and_the_same_one_does_not() {
+    const RENEWED: &str = "the host's process is gone and another has come: the MCU is reset for it";
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("master");
+    let mut host = Host::start(&pinion, &checkout);
+    configure_and_stop(&pinion);
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    host.turn("open");
+    assert!(is_shutdown(&pinion), "RESTART keeps the process");
+    assert!(!pinion.log().contains(RENEWED));
+    until_once_more(&pinion, "host gone", || drop(host));
+    let mut host = Host::start(&pinion, &checkout);
+    assert!(!is_shutdown(&pinion), "a new process");
+    pinion.logged(RENEWED);
+    // A process that looks in while the host lives changes nothing.
+    configure_and_stop(&pinion);
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    let other = Host::start(&pinion, &checkout);
+    assert!(is_shutdown(&pinion), "the host lives");
+    until_once_more(&pinion, "host gone", || drop(other));
+    host.turn("open");
+    assert!(is_shutdown(&pinion), "the host of before");
 }
 
 #[test]
@@ -213,9 +252,10 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
         sources.replace("query_adxl345 oid=%c rest_ticks=%u", "query_adxl345 oid=%c rest_ticks=%u range=%c")
     });
     let _host = Host::start(&pinion, &checkout);
-    assert!(pinion.client().dictionary().commands.contains_key(MANY_VALUES), "the nearest dialect");
+    assert!(pinion.client().dictionary().commands.contains_key(MANY_VALUES), "the others work");
+    pinion.logged(": it gets all but 1 messages that it looks up (found in ");
     let line = pinion.logged("the host is newer than Pinion");
-    assert!(line.contains("forms of messages: query_adxl345 oid rest_ticks range: "), "{line}");
+    assert!(line.contains(" for ADXL345 accelerometers: query_adxl345 oid rest_ticks range: "), "{line}");
     // An empty root, so that no file of this computer counts.
     let system = tempfile::tempdir().unwrap();
     let root = system.path().to_str().unwrap();
@@ -223,15 +263,13 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     let newer = doctor(checkout.0.path());
     let report = String::from_utf8_lossy(&newer.stdout).into_owned();
     assert_eq!(newer.status.code(), Some(1), "{report}");
-    assert!(
-        report.contains("No dialect has these forms") && report.contains("\n  query_adxl345 oid rest_ticks range\n")
-    );
+    assert!(report.contains("\n  ADXL345 accelerometers\n    query_adxl345 oid rest_ticks range\n"), "{report}");
     checkout.change("v0.12", |sources| sources);
     let known = doctor(checkout.program().parent().unwrap());
     let report = String::from_utf8_lossy(&known.stdout).into_owned();
     assert_eq!(known.status.code(), Some(0), "{report}");
     assert!(
-        report.contains("ok: this host is served in the dialect v0.12, which has all that it looks up"),
+        report.contains("ok: this host gets each message that it looks up, in a form that it looks up"),
         "{report}"
     );
     let none = doctor(Path::new("/nonexistent"));
@@ -300,7 +338,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         assert_eq!(has_it, may_look);
         if may_look {
             let line = until("the host is klippy of ");
-            assert!(line.contains(&format!("process {}: dialect v0.12", host.0.id())), "{line}");
+            assert!(line.contains(&format!("process {}: it gets each message", host.0.id())), "{line}");
             let search = search_of(pinion.0.id()).unwrap();
             assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
             // Another process of its user cannot get at them through its memory: the kernel asks for the same rights.

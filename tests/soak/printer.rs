@@ -125,7 +125,7 @@ impl Printer {
     /// A host begins to talk to the MCU, in a dialect of its own. It reads its dictionary.
     pub fn meet(&mut self, dialect: usize) {
         let dialect = self.dialects[dialect].clone();
-        self.note(format!("a host of {}", dialect.name()));
+        self.note(format!("a host of {}", dialect.forms().label()));
         self.rig.mcu.speak(dialect.clone());
         self.messages = Messages::new(dialect.dictionary());
         let mut read = Vec::new();

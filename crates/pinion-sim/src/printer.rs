@@ -194,6 +194,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         cpu: None,
         margin: if is_tried { MarginLimits::always(Ticks(0)) } else { MarginLimits::default() },
         watchdog: None,
+        tolerances: Vec::new(),
         trace_edges: args.trace_edges,
         sockets,
     };

@@ -20,7 +20,7 @@ use log::{error, info, warn};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{DialectName, Firmware, Wire};
+use pinion_firmware::mcu::{DialectName, Firmware, Tolerances, Wire};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
@@ -114,6 +114,8 @@ pub struct Options {
     pub watchdog: Option<PathBuf>,
     /// The only processor that the core runs on.
     pub cpu: Option<usize>,
+    /// The devices whose failures are tolerated, and for how long.
+    pub tolerances: Tolerances,
     /// Whether the flight recorder notes each edge of each output.
     pub trace_edges: bool,
     /// Possible paths of the status socket: the first one that works is used. Without any there is no socket.
@@ -182,6 +184,7 @@ pub fn run(
         edges,
         timing,
         dialect,
+        tolerances: options.tolerances.clone(),
         wake,
         heartbeat,
         snapshots,

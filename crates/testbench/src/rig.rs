@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Mcu, Note, Outbox, Wire};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Forms, Mcu, Note, Outbox, Wire};
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing, VirtualClock};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
@@ -49,6 +49,7 @@ impl Outbox for FakeOutbox {
             Note::Safe(name) => format!("safe: {name}"),
             Note::Lateness(..) => return,
             Note::Reset => "reset".into(),
+            Note::Renewed => "renewed".into(),
         };
         self.notes.lock().unwrap().push(text);
     }
@@ -85,12 +86,12 @@ impl Rig {
 
     /// An MCU with another board than the bench's own.
     pub fn on_board<B: Board + 'static>(start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
-        Rig::that_speaks(DialectName::Master, start, board)
+        Rig::that_speaks(DialectName::Master.into(), start, board)
     }
 
-    /// An MCU for hosts of this dialect.
-    pub fn of(name: DialectName) -> Rig {
-        Rig::that_speaks(name, ORIGIN, FakeBoard)
+    /// An MCU with messages of these forms.
+    pub fn of(forms: impl Into<Forms>) -> Rig {
+        Rig::that_speaks(forms.into(), ORIGIN, FakeBoard)
     }
 
     /// An MCU with a dialect that was made before.
@@ -98,8 +99,8 @@ impl Rig {
         Rig::made(ORIGIN, FakeBoard, |_| dialect)
     }
 
-    fn that_speaks<B: Board + 'static>(name: DialectName, start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
-        Rig::made(start, board, |board| Arc::new(Dialect::new(&FIRMWARE, board, name).unwrap()))
+    fn that_speaks<B: Board + 'static>(forms: Forms, start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
+        Rig::made(start, board, |board| Arc::new(Dialect::new(&FIRMWARE, board, forms).unwrap()))
     }
 
     fn made<B: Board + 'static>(
@@ -369,8 +370,8 @@ impl Rig {
     }
 
     /// Gives the MCU another dialect. It may not use it before a reset.
-    pub fn speak(&mut self, name: DialectName) {
-        let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), name);
+    pub fn speak(&mut self, forms: impl Into<Forms>) {
+        let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), forms);
         self.mcu.speak(Arc::new(dialect.unwrap()));
     }
 

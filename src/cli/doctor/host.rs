@@ -11,10 +11,11 @@ use crate::cli::finding::{Finding, Level};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::trouble::Trouble;
-use pinion_runtime::klippy::Checkout;
+use pinion_runtime::klippy::{self as host, Checkout};
 
 use super::UPGRADE;
 use super::instance::Instance;
+use super::klipper;
 
 /// The checks that are left out because a klippy's configuration cannot be used.
 pub(super) fn unchecked(klippys: &[Klippy]) -> Vec<Finding> {
@@ -82,28 +83,38 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
             return vec![Finding::warning(DIALECT, found, "sudo pinion doctor, or pinion doctor --klipper DIR")];
         }
     };
-    let best = checkout.best();
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));
     let host = format!("the host is klippy of {}{commit} ({found_by})", shown.display());
+    let missing = klipper::missing(&checkout);
     let serves = |instance: &&Instance| instance.link.as_ref().is_some_and(|link| klippy.opens(link));
     let configured =
         instances.iter().filter(serves).filter_map(|instance| Some((instance, instance.settings.dialect?)));
     let configured: Vec<(&Instance, DialectName)> = configured.collect();
-    let wrong = configured.iter().find(|(_, name)| *name != best.dialect);
-    let mut findings = vec![match (wrong, configured.is_empty()) {
-        (None, true) => Finding::ok(DIALECT, format!("{host}: it is served in the dialect {}", best.dialect)),
-        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as configured", best.dialect)),
-        (Some((instance, name)), _) => Finding::warning(
+    // A dialect that is configured may lack messages that the host would get without it.
+    let lacks = |name: DialectName| checkout.missing(&name.into(), FEATURES);
+    let wrong = configured.iter().map(|(instance, name)| (instance, name, lacks(*name)));
+    let wrong = wrong.max_by_key(|(_, _, lacks)| lacks.len()).filter(|(_, _, lacks)| lacks.len() > missing.len());
+    let mut findings = vec![match (wrong, configured.first()) {
+        (Some((instance, name, lacks)), _) => Finding::warning(
             DIALECT,
-            format!("{host}: its dialect is {}, and Pinion's configuration says {name}", best.dialect),
+            format!(
+                "{host}: Pinion's configuration names the dialect {name}, which lacks {} messages of this host{}",
+                lacks.len(),
+                klipper::for_parts(&lacks)
+            ),
             format!("dialect = \"auto\" in {}, then {}", instance.config(), instance.restart()),
         ),
+        (None, Some((_, name))) => Finding::ok(DIALECT, format!("{host}: dialect {name}, as configured")),
+        (None, None) => Finding::ok(DIALECT, format!("{host}: it gets the messages that it looks up")),
     }];
-    let unknown: Vec<&str> = checkout.unknown().map(|shape| shape.as_str()).collect();
-    if !unknown.is_empty() {
+    if !missing.is_empty() {
         findings.push(Finding::error(
             DIALECT,
-            format!("the host is newer than Pinion, which does not know: {}", unknown.join("; ")),
+            format!(
+                "the host is newer than Pinion, which does not have these messages{}: {}",
+                klipper::for_parts(&missing),
+                host::names(&missing)
+            ),
             UPGRADE,
         ));
     }
@@ -118,8 +129,7 @@ mod tests {
     use crate::cli::computer::klippy::klippys;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use pinion_firmware::mcu::DialectName;
-    use pinion_runtime::klippy::sources::Shape;
+    use pinion_firmware::mcu::{DialectName, Forms, Part, entries};
 
     #[test]
     fn the_host_s_dialect() {
@@ -132,31 +142,25 @@ mod tests {
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
         says(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
-        let commands = FEATURES.iter().flat_map(|feature| feature.commands);
-        let responses = FEATURES.iter().flat_map(|feature| feature.responses);
-        let formats = commands.map(|one| (one.format, one.dialects));
-        let forms: Vec<String> = formats
-            .chain(responses.map(|one| (one.format, one.dialects)))
-            .filter(|(_, dialects)| dialects.contains(DialectName::V0_12))
-            .filter_map(|(format, _)| Shape::of(format))
-            .map(|shape| {
-                let form = shape.as_str();
-                let (name, parameters) = form.split_once(' ').unwrap();
-                let parameters: Vec<String> = parameters.split(' ').map(|name| format!("{name}=%u")).collect();
-                format!("mcu.lookup_command(\"{name} {}\")\n", parameters.join(" "))
-            })
+        let entries = entries(FEATURES);
+        let parts = Forms::from(DialectName::V0_12).parts(&entries);
+        let forms: Vec<String> = entries
+            .iter()
+            .zip(parts)
+            .filter(|(entry, part)| entry.is_message() && *part == Part::Needed)
+            .map(|(entry, _)| format!("mcu.lookup_command(\"{}\")\n", entry.text))
             .collect();
         tree.put("home/pi/klipper/klippy/mcu.py", forms.concat());
-        says(&look(), "dialect", Ok, "it is served in the dialect v0.12");
+        says(&look(), "dialect", Ok, "it gets the messages that it looks up");
         let speak = |name: &str| tree.put("etc/pinion/pinion.toml", format!("dialect = \"{name}\"\n"));
         speak("v0.12");
         says(&look(), "dialect", Ok, "as configured");
         speak("kalico");
-        says(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion's configuration says kalico");
+        says(&look(), "dialect", Warning, "names the dialect kalico, which lacks ");
         // This klippy is another instance's host.
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
-        says(&look(), "dialect", Ok, "it is served in the dialect v0.12");
-        tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_adxl345 oid=%c wings=%u\")\n");
-        says(&look(), "dialect", Error, "query_adxl345 oid wings");
+        says(&look(), "dialect", Ok, "it gets the messages that it looks up");
+        tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_ads1220 oid=%c wings=%u\")\n");
+        says(&look(), "dialect", Error, "for ADS1220 load cells: query_ads1220 oid wings");
     }
 }

@@ -1,16 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion doctor --klipper DIR`: whether this Pinion serves the host of a checkout.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::cli::finding::Finding;
 use crate::cli::page::Page;
 use pinion_firmware::feature::FEATURES;
-use pinion_runtime::klippy::sources::Shape;
-use pinion_runtime::klippy::{Checkout, DialectFit};
+use pinion_firmware::mcu::Forms;
+use pinion_runtime::klippy::{Checkout, Missing, parts_without};
 
 use super::UPGRADE;
+
+/// Highest number of missing messages that the report names for a part of the printer.
+const SHOWN: usize = 20;
 
 /// Reads a checkout. `folder` is the checkout, or klippy's folder in it.
 pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
@@ -24,73 +27,60 @@ pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
     })
 }
 
+/// The messages that the host of a checkout looks up and does not get from a Pinion that reads its sources.
+pub(super) fn missing(checkout: &Checkout) -> Vec<Missing<'_>> {
+    checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES)
+}
+
 /// The verdict in a line.
 pub(super) fn finding(checkout: &Checkout) -> Finding {
     const CHECK: &str = "checkout";
-    let host = format!("{} is served in the dialect {}", checkout.folder.display(), checkout.best().dialect);
-    match checkout.unknown().count() {
-        0 => Finding::ok(CHECK, host),
-        forms => Finding::error(
+    let host = format!("the host of {}", checkout.folder.display());
+    let missing = missing(checkout);
+    match missing.len() {
+        0 => Finding::ok(CHECK, format!("{host} gets each message that it looks up")),
+        count => Finding::error(
             CHECK,
-            format!("{host}, and looks up {forms} forms of messages that no dialect has"),
+            format!("{host} does not get {count} messages that it looks up{}", for_parts(&missing)),
             format!("before the host is restarted, {UPGRADE}"),
         ),
     }
 }
 
-/// The report: each dialect, the forms in which they differ, the verdict.
+/// The parts of the printer that these messages serve, as an addition to a sentence.
+pub(super) fn for_parts(missing: &[Missing<'_>]) -> String {
+    let parts = parts_without(missing);
+    if parts.is_empty() { String::new() } else { format!(", for {parts}") }
+}
+
+/// The report: the messages that the host does not get, by part of the printer, and the verdict.
 pub(super) fn report(checkout: &Checkout, page: &mut Page) {
-    let best = checkout.best();
-    let all: BTreeSet<&Shape> = best.served.union(&best.other).collect();
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));
     page.line(format_args!("{}{commit}", checkout.folder.display()));
-    page.line(format_args!(
-        "This host looks up {} forms of messages that Pinion knows by name. Each dialect has of them:",
-        all.len()
-    ));
+    page.line(format_args!("This host looks up {} forms of messages.", checkout.shapes.len()));
     page.line("");
-    for fit in &checkout.fits {
-        let mark = if fit.dialect == best.dialect { "  <- the one that it is served" } else { "" };
-        page.line(format_args!("  {:<8}{:>4}{mark}", fit.dialect.name(), fit.served.len()));
-    }
     if let Some(unread) = &checkout.unread {
-        page.line("");
         page.line(format_args!("Not all of it can be read, and what is left out here does not count: {unread}"));
+        page.line("");
     }
-    let differing: Vec<&Shape> =
-        all.into_iter().filter(|shape| checkout.fits.iter().any(|fit| fit.other.contains(shape))).collect();
-    if !differing.is_empty() {
-        let columns = |of: &dyn Fn(&DialectFit) -> &'static str| -> String {
-            checkout.fits.iter().map(|fit| format!("{:<8}", of(fit))).collect()
-        };
-        page.append(&Page::text("\nNot every dialect has these forms:\n\n"));
-        page.line(format_args!("  {}", columns(&|fit| fit.dialect.name())));
-        for shape in differing {
-            let has = columns(&|fit| if fit.served.contains(shape) { "yes" } else { "-" });
-            page.line(format_args!("  {has}{}", shape.as_str()));
+    let missing = missing(checkout);
+    if missing.is_empty() {
+        page.line("ok: this host gets each message that it looks up, in a form that it looks up");
+        return;
+    }
+    page.line("warning: this host looks up messages that Pinion does not have in this form. These parts do not work:");
+    let mut by_part: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for Missing { shape, serves } in &missing {
+        by_part.entry(serves).or_default().push(shape.as_str());
+    }
+    for (part, shapes) in by_part {
+        page.line("");
+        page.line(format_args!("  {}", if part.is_empty() { "parts that are new in this host" } else { part }));
+        shapes.iter().take(SHOWN).for_each(|shape| page.line(format_args!("    {shape}")));
+        if shapes.len() > SHOWN {
+            page.line(format_args!("    and {} more", shapes.len() - SHOWN));
         }
     }
-    let unknown: Vec<&Shape> = checkout.unknown().collect();
     page.line("");
-    if unknown.is_empty() {
-        let other = match best.other.len() {
-            0 => ", which has all that it looks up".to_owned(),
-            other => format!(
-                "; of the forms above it looks up {other} for other micro-controllers' sake, as its own firmware for \
-                 Linux has no more than the dialect"
-            ),
-        };
-        page.line(format_args!("ok: this host is served in the dialect {}{other}", best.dialect));
-    } else {
-        page.line(
-            "warning: this host is newer than Pinion. No dialect has these forms, and what needs them will not work:",
-        );
-        page.line("");
-        unknown.iter().for_each(|shape| page.line(format_args!("  {}", shape.as_str())));
-        page.line("");
-        page.line(format_args!(
-            "It would be served in the dialect {}. Update Pinion first (apt upgrade), or stay with the host's version.",
-            best.dialect
-        ));
-    }
+    page.line("Update Pinion first (apt upgrade), or stay with the host's version.");
 }

@@ -69,7 +69,10 @@ fn state(status: &Status) -> String {
 }
 
 fn host(host: &Host, mcu: Option<&McuStatus>) -> String {
-    let dialect = mcu.and_then(|mcu| mcu.dialect.as_ref()).map_or(String::new(), |name| format!("; dialect {name}"));
+    let dialect = mcu.and_then(|mcu| mcu.dialect.as_ref()).map_or(String::new(), |name| match name.as_str() {
+        "host" => "; its own messages".to_owned(),
+        name => format!("; dialect {name}"),
+    });
     if !host.attached {
         return format!("none is attached{dialect}");
     }
@@ -115,6 +118,9 @@ fn object(object: &Object) -> Vec<String> {
         Present::Duty(share) => format!("on {:.1} %", share * 100.0),
         Present::Steps(steps) => format!("at {steps} steps"),
     }));
+    if object.repeats {
+        facts.push("fails, and repeats its last answers".into());
+    }
     if object.queued > 0 {
         facts.push(format!("{} queued", object.queued));
     }

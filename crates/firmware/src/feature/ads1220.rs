@@ -5,10 +5,8 @@
 //! Format"). klippy itself sets up the chip.
 
 use crate::board::Pin;
-use crate::mcu::{
-    Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Feature, JobSlot, Oid, command,
-    since,
-};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
+use crate::mcu::{Command, Context, Feature, JobSlot, Oid, command};
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
@@ -17,6 +15,8 @@ use super::spi::spi_shutdown;
 use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "ADS1220 load cells",
+
     commands: &[
         CONFIG_ADS1220,
         ADS1220_ATTACH_TRIGGER_ANALOG,
@@ -58,30 +58,31 @@ const CONFIG_ADS1220: Command = command!(
         configure_spi(context, oid, (spi_oid, data_ready_pin), Ads1220 { spi: spi_oid }, SAMPLE_BYTES)
     }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const ADS1220_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
     |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const ADS1220_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads1220_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
     |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_ADS1220: Command =
     command!("query_ads1220 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_ADS1220_STATUS: Command =
-    command!("query_ads1220_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
+const QUERY_ADS1220_STATUS: Command = command!("query_ads1220_status oid=%c", Sensor, |sensor, context| sensor
+    .query_status(context))
+.of(&[V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -5,9 +5,8 @@
 //! ("SPI Communication Frames"). The response to NULL is the STATUS register.
 
 use crate::board::Pin;
-use crate::mcu::{
-    Command, Context, DialectName::Kalico, DialectName::Master, Enumeration, Feature, JobSlot, Oid, command, since,
-};
+use crate::mcu::DialectName::{Kalico, Master};
+use crate::mcu::{Command, Context, Enumeration, Feature, JobSlot, Oid, command};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
 
@@ -17,6 +16,8 @@ use super::spi::spi_shutdown;
 use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "ADS131M0x load cells",
+
     commands: &[
         CONFIG_ADS131M0X,
         CONFIG_ADS131M0X_OF_KALICO,
@@ -28,7 +29,7 @@ pub(super) const FEATURE: Feature = Feature {
     enumerations: &[Enumeration::new("ads131m0x_error:", |_| {
         named(&[("SENSOR_ERROR_CRC", ERROR_CRC), ("SENSOR_ERROR_RESET", ERROR_RESET)])
     })
-    .of(since(Master))],
+    .of(&[Master])],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -193,7 +194,7 @@ const CONFIG_ADS131M0X: Command = command!(
         configure_spi(context, oid, (spi_oid, data_ready_pin), chip, frame_bytes(num_channels))
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c data_ready_pin=%u sensor_channel_count=%c channel_mask=%c",
@@ -214,31 +215,31 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
         configure_spi(context, oid, (spi_oid, data_ready_pin), chip, frame_bytes(sensor_channel_count))
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const ADS131M0X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads131m0x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
     |sensor, context, trigger_analog_oid: Oid| sensor.attached.attach(context, trigger_analog_oid)
 )
-.of(since(Master));
+.of(&[Master]);
 
 const ADS131M0X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads131m0x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
     |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_ADS131M0X: Command =
     command!("query_ads131m0x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(Master).and(Kalico));
+    .of(&[Master, Kalico]);
 
 const QUERY_ADS131M0X_STATUS: Command = command!("query_ads131m0x_status oid=%c", Sensor, |sensor, context| sensor
     .query_status(context))
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

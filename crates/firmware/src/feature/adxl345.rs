@@ -6,15 +6,16 @@
 //! wires. FIFO_STATUS has the number of samples, so no separate query comes first.
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{
-    Command, DialectName::V0_12, DialectName::V0_13, Feature, Oid, Response, WireClock, command, since, until,
-};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
+use crate::mcu::{Command, Feature, Hosts, Oid, Response, WireClock, command};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "ADXL345 accelerometers",
+
     commands: &[CONFIG_ADXL345, QUERY_ADXL345_AT, QUERY_ADXL345, QUERY_ADXL345_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
     ..Feature::EMPTY
@@ -22,7 +23,7 @@ pub(super) const FEATURE: Feature = Feature {
 
 own_words! {
     "adxl345_data oid=%c sequence=%hu data=%*s",
-    "adxl345_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => until(V0_12);
+    "adxl345_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => Hosts::of(&[V0_11, V0_12]);
     data_max: 50, sample_bytes: SAMPLE_BYTES, fifo: u8
 }
 
@@ -121,13 +122,13 @@ const QUERY_ADXL345_AT: Command = command!(
     Sensor,
     |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
-.of(until(V0_12));
+.of(&[V0_11, V0_12]);
 
 const QUERY_ADXL345: Command =
     command!("query_adxl345 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
 const QUERY_ADXL345_STATUS: Command =
     command!("query_adxl345_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context));

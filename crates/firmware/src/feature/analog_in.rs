@@ -4,11 +4,12 @@
 //! A worker takes the readings, because each may block. If the ADC is slower than the host wants, samples are skipped.
 //! Timers and steps do not wait for it. A failed reading drops its sum.
 
+use super::ds18b20::CONFIG_DS18B20_OF_KALICO;
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, DialectName::Kalico, DialectName::Master,
-    DialectName::V0_13, Feature, Finished, Job, JobSlot, Next, Object, Oid, Present, Report, Response, Timer, Unread,
-    WireClock, command, response, since, until,
+    Back, BusCounts, Calls, Command, Constant, Context, DeviceId, Feature, Finished, Hosts, Job, JobSlot, Next, Object,
+    Oid, Present, Report, Response, Timer, Unread, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -16,6 +17,8 @@ use crate::time::{Clock, Ticks};
 use super::trigger_analog::Attached;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "thermistors and other analog inputs",
+
     commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, QUERY_ANALOG_IN_FOR_BATCHES, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
     responses: &[State::FORM, Batch::FORM],
     constants: &[Constant::number("ADC_MAX", ADC_MAX as u32)],
@@ -32,13 +35,13 @@ shutdowns! {
 
 response! {
     /// A sum of readings.
-    "analog_in_state oid=%c next_clock=%u value=%hu" => until(V0_13).and(Kalico);
+    "analog_in_state oid=%c next_clock=%u value=%hu" => Hosts::of(&[V0_11, V0_12, V0_13, Kalico]).with(QUERY_ANALOG_IN.format);
     pub(super) struct State { oid: Oid, next_clock: Clock, value: u16 }
 }
 
 response! {
     /// Sums of readings, two bytes each, low byte first.
-    "analog_in_state oid=%c next_clock=%u values=%*s" => since(Master);
+    "analog_in_state oid=%c next_clock=%u values=%*s" => Hosts::of(&[Master]).with(QUERY_ANALOG_IN_FOR_BATCHES.format);
     pub(super) struct Batch<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
 }
 
@@ -163,7 +166,7 @@ impl AnalogIn {
 
     fn check_range(&mut self, context: &Context) -> Result<(), Shutdown> {
         // Kalico ignores limits this way (`temp_ignore_limits`).
-        if self.query.range_check_count == 0 && context.serves(since(Kalico)) {
+        if self.query.range_check_count == 0 && context.takes(&CONFIG_DS18B20_OF_KALICO) {
             return Ok(());
         }
         if (self.query.min_value..=self.query.max_value).contains(&self.sum) {
@@ -266,7 +269,7 @@ impl Object for AnalogIn {
     }
 
     fn report(&self) -> Report {
-        Report { queued: 0, value: self.last.map(Present::Adc) }
+        Report { value: self.last.map(Present::Adc), ..Report::default() }
     }
 
     fn counts(&self) -> Option<BusCounts> {
@@ -330,7 +333,7 @@ const QUERY_ANALOG_IN: Command = command!(
         input.query(context, at, query)
     }
 )
-.of(until(V0_13).and(Kalico));
+.of(&[V0_11, V0_12, V0_13, Kalico]);
 
 const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c",
@@ -359,11 +362,11 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
         input.query(context, at, query)
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     AnalogIn,
     |input, context, trigger_analog_oid: Oid| input.attached.attach(context, trigger_analog_oid)
 )
-.of(since(Master));
+.hosts(Hosts::of(&[Master]).with(QUERY_ANALOG_IN_FOR_BATCHES.format));

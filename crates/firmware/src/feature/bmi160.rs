@@ -5,13 +5,17 @@
 //! FIFO_DATA"). klippy configures the FIFO for bare samples of the accelerometer.
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, DialectName::Master, Feature, Oid, command, since};
+use crate::mcu::DialectName::Master;
+use crate::mcu::{Command, Feature, Oid, command};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 
-pub(super) const FEATURE: Feature =
-    Feature { commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    serves: "BMI160 accelerometers",
+    commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS],
+    ..Feature::EMPTY
+};
 
 #[derive(Clone, Copy)]
 enum Register {
@@ -66,16 +70,16 @@ const CONFIG_BMI160: Command =
     command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |context, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
         configure(context, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 const QUERY_BMI160: Command =
     command!("query_bmi160 oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 const QUERY_BMI160_STATUS: Command =
-    command!("query_bmi160_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context)).of(since(Master));
+    command!("query_bmi160_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context)).of(&[Master]);
 
 #[cfg(test)]
 mod tests {

@@ -11,6 +11,8 @@ use crate::time::{Clock, Ticks};
 use super::bias;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "buttons and filament sensors",
+
     commands: &[CONFIG_BUTTONS, BUTTONS_ADD, BUTTONS_QUERY, BUTTONS_ACK],
     responses: &[State::FORM],
     shutdowns: SHUTDOWNS,

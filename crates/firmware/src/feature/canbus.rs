@@ -8,6 +8,8 @@ use crate::mcu::{
 use crate::shutdown::shutdowns;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "CAN bus",
+
     commands: &[GET_CANBUS_ID, GET_CANBUS_STATUS],
     responses: &[CanbusId::FORM, CanbusStatus::FORM],
     enumerations: &[Enumeration::new("canbus_bus_state", |_board| states())],

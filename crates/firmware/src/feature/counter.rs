@@ -20,8 +20,12 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
 use super::bias;
 
-pub(super) const FEATURE: Feature =
-    Feature { commands: &[CONFIG_COUNTER, QUERY_COUNTER], responses: &[State::FORM], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    serves: "tachometers of fans",
+    commands: &[CONFIG_COUNTER, QUERY_COUNTER],
+    responses: &[State::FORM],
+    ..Feature::EMPTY
+};
 
 response! {
     /// The edges so far, the time of the next sample, and the time of the last edge. klippy assumes that the count was

@@ -12,6 +12,8 @@ use crate::time::{Clock, Ticks};
 use super::{changes_too_late, not_refreshed, set_too_late};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "output pins",
+
     commands: &[CONFIG_DIGITAL_OUT, SET_DIGITAL_OUT_PWM_CYCLE, QUEUE_DIGITAL_OUT, UPDATE_DIGITAL_OUT, SET_DIGITAL_OUT],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -173,7 +175,7 @@ impl Object for DigitalOut {
     }
 
     fn report(&self) -> Report {
-        Report { queued: self.queue.len(), value: None }
+        Report { queued: self.queue.len(), ..Report::default() }
     }
 
     fn shutdown(&mut self, context: &mut Context) {

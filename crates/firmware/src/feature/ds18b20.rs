@@ -6,17 +6,20 @@
 //! reported as soon as it arrives. Klipper's C reports it when the next one is due.
 
 use crate::board::Thermometer;
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DialectName::Kalico, Dialects, Feature, Finished, Job, JobSlot, Next, Object,
-    Oid, Response, Timer, WireClock, command, response, since,
+    Back, Command, Context, Device, DeviceId, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid, Report,
+    Response, Timer, Tolerance, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 use crate::trouble::Trouble;
 
 pub(super) const FEATURE: Feature = Feature {
-    commands: &[CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
-    responses: &[Reading::FORM],
+    serves: "DS18B20 sensors",
+
+    commands: &[CONFIG_DS18B20_OF_V0_10, CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
+    responses: &[ReadingOfV010::FORM, Reading::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -30,6 +33,12 @@ shutdowns! {
     TOO_SLOW = "DS18B20 sensor didn't respond in time";
     /// A temperature outside its range.
     OUT_OF_RANGE = "DS18B20 out of range";
+}
+
+response! {
+    /// A temperature in thousandths of a degree.
+    "ds18b20_result oid=%c next_clock=%u value=%i" => Hosts::of(&[]).with(CONFIG_DS18B20_OF_V0_10.format);
+    pub(super) struct ReadingOfV010 { oid: Oid, next_clock: Clock, value: i32 }
 }
 
 response! {
@@ -73,7 +82,12 @@ struct Ds18b20 {
     /// How many readings failed since the last success.
     error_count: u8,
     value: i32,
+    /// Whether a reading has succeeded.
+    has_value: bool,
+    tolerance: Option<Tolerance>,
 }
+
+const KIND: &str = "DS18B20";
 
 impl Ds18b20 {
     fn check_range(&self, context: &Context) -> Result<(), Shutdown> {
@@ -95,7 +109,11 @@ impl Ds18b20 {
 
 impl Object for Ds18b20 {
     fn kind(&self) -> &'static str {
-        "DS18B20"
+        KIND
+    }
+
+    fn report(&self) -> Report {
+        Report { repeats: self.tolerance.as_ref().is_some_and(Tolerance::is_used), ..Report::default() }
     }
 
     fn event(&mut self, context: &mut Context, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
@@ -120,7 +138,16 @@ impl Object for Ds18b20 {
             Ok(value) => {
                 self.value = value;
                 self.error_count = 0;
+                self.has_value = true;
+                if let Some(tolerance) = &mut self.tolerance {
+                    tolerance.works(context, KIND, READ_FAILED);
+                }
             }
+            Err(trouble)
+                if self.has_value
+                    && self.tolerance.as_mut().is_some_and(|tolerance| {
+                        tolerance.bears(context, KIND, |_| Shutdown::because(READ_FAILED, trouble.clone()))
+                    }) => {}
             Err(trouble) => {
                 self.error_count = self.error_count.saturating_add(1);
                 if self.error_count > self.max_error_count {
@@ -131,12 +158,10 @@ impl Object for Ds18b20 {
             }
         }
         let fault = self.error_count;
-        context.send(Reading {
-            oid: context.oid(),
-            next_clock: self.next_clock,
-            value: self.value,
-            fault: fault.into(),
-        });
+        let (oid, next_clock, value) = (context.oid(), self.next_clock, self.value);
+        context.send(Reading { oid, next_clock, value, fault: fault.into() });
+        // The dictionary has one of both.
+        context.send(ReadingOfV010 { oid, next_clock, value });
         if fault == 0 { self.check_range(context) } else { Ok(()) }
     }
 
@@ -171,23 +196,32 @@ fn configure(
         ignores_limits,
         error_count: 0,
         value: 0,
+        has_value: false,
+        tolerance: context.tolerance(&Device::OneWire(String::from_utf8_lossy(serial).into_owned())),
     };
     context.assign(oid, sensor)
 }
+
+const CONFIG_DS18B20_OF_V0_10: Command =
+    command!("config_ds18b20 oid=%c serial=%*s", |context, oid: Oid, serial: &[u8]| {
+        configure(context, oid, serial, 0, false)
+    })
+    .of(&[]);
 
 const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
     |context, oid: Oid, serial: &[u8], max_error_count: u8| configure(context, oid, serial, max_error_count, false)
 )
-.of(Dialects::ALL.except(Kalico));
+.of(&[V0_11, V0_12, V0_13, Master]);
 
-const CONFIG_DS18B20_OF_KALICO: Command = command!(
+/// Hosts with this form also ignore the limits of other sensors.
+pub(super) const CONFIG_DS18B20_OF_KALICO: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c ignore_limits=%c",
     |context, oid: Oid, serial: &[u8], max_error_count: u8, ignore_limits: bool| {
         configure(context, oid, serial, max_error_count, ignore_limits)
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",

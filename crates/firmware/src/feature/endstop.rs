@@ -13,6 +13,8 @@ use super::bias;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "endstops",
+
     commands: &[CONFIG_ENDSTOP, ENDSTOP_HOME, ENDSTOP_QUERY_STATE],
     responses: &[State::FORM],
     ..Feature::EMPTY

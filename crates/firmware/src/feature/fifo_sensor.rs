@@ -8,9 +8,9 @@
 //! returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
 use crate::board::{BusDevice, BusError};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Back, Chip, Context, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Timer,
-    WireClock, since,
+    Back, Chip, Context, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Timer, WireClock,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -21,7 +21,9 @@ use super::sensor_bulk::{BulkData, DATA_MAX, SensorBulk, Words};
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
-    enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)])).of(since(V0_13))],
+    serves: "accelerometers",
+
+    enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)])).of(&[V0_13, Master, Kalico])],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -12,8 +12,11 @@ use crate::time::Ticks;
 use super::display::{Busy, Display, Panel, Register, Wire, hold};
 use super::pace::Pace;
 
-pub(super) const FEATURE: Feature =
-    Feature { commands: &[CONFIG_HD44780, HD44780_SEND_CMDS, HD44780_SEND_DATA], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    serves: "HD44780 displays",
+    commands: &[CONFIG_HD44780, HD44780_SEND_CMDS, HD44780_SEND_DATA],
+    ..Feature::EMPTY
+};
 
 /// Shortest time that E is high: 230 ns, rounded up to ticks of 20 ns.
 const PULSE: Ticks = Ticks(12);

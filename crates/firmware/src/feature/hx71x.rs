@@ -10,11 +10,11 @@
 //! too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
 use crate::board::{Bias, Direction, Mosi, OnWorker, Pin};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DeviceId, DeviceWarning, DialectName::Kalico, DialectName::Master, DialectName::V0_13,
-    Feature, Finished, Job, JobSlot, Oid, Remote, Settable, command, since,
+    Back, Command, Context, DeviceId, DeviceWarning, Feature, Finished, Job, JobSlot, Oid, Remote, Settable, command,
 };
-use crate::shutdown::{Shutdown, reason, shutdowns};
+use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::Ticks;
 
 use super::ready_adc::{Ready, ReadyAdc, ReadyChip, Sample};
@@ -25,8 +25,11 @@ mod lines;
 mod spi;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "HX711 and HX717 load cells",
+
     commands: &[
         CONFIG_HX71X,
+        CONFIG_HX71X_BY_PULSES,
         HX71X_ATTACH_TRIGGER_ANALOG,
         HX71X_ATTACH_LOAD_CELL_PROBE,
         QUERY_HX71X,
@@ -39,6 +42,8 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// The number of pulses for gain and channel is not one to four.
     GAIN_RANGE = "HX71x gain/channel out of range 1-4";
+    /// The same, where the host calls the number `setting_pulses`.
+    PULSES_RANGE = "HX71x setting_pulses out of range 1-4";
 }
 
 /// klippy recognizes errors by these values: pulses and bits do not match, or a reading took too long.
@@ -193,11 +198,18 @@ impl ReadyChip for Hx71x {
     }
 }
 
-fn configure(context: &mut Context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
+/// `out_of_range` is the reason of the shutdown for a `gain_channel` outside 1 to 4.
+fn configure(
+    context: &mut Context,
+    oid: Oid,
+    (gain_channel, out_of_range): (u8, ShutdownReason),
+    dout_pin: Pin,
+    sclk_pin: Pin,
+) -> Result<(), Shutdown> {
     context.vacant(oid)?;
     if !(1..=4).contains(&gain_channel) {
         return Err(Shutdown::by_host(
-            GAIN_RANGE,
+            out_of_range,
             format_args!("{gain_channel} pulses are to choose gain and channel"),
         ));
     }
@@ -238,33 +250,43 @@ type Sensor = ReadyAdc<Hx71x>;
 const CONFIG_HX71X: Command = command!(
     "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u",
     |context, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
-        configure(context, oid, gain_channel, dout_pin, sclk_pin)
+        configure(context, oid, (gain_channel, GAIN_RANGE), dout_pin, sclk_pin)
     }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
+
+/// The form of an open change of Kalico (July 2026).
+const CONFIG_HX71X_BY_PULSES: Command = command!(
+    "config_hx71x oid=%c setting_pulses=%c dout_pin=%u sclk_pin=%u",
+    |context, oid: Oid, setting_pulses: u8, dout_pin: Pin, sclk_pin: Pin| {
+        configure(context, oid, (setting_pulses, PULSES_RANGE), dout_pin, sclk_pin)
+    }
+)
+.of(&[]);
 
 const HX71X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Sensor,
     |sensor, context, trigger_analog_oid: Oid| { sensor.attached.attach(context, trigger_analog_oid) }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     Sensor,
     |sensor, context, load_cell_probe_oid: Oid| sensor.attached.attach_probe(context, load_cell_probe_oid)
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const QUERY_HX71X: Command =
     command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor.query_status(context)).of(since(V0_13));
+const QUERY_HX71X_STATUS: Command = command!("query_hx71x_status oid=%c", Sensor, |sensor, context| sensor
+    .query_status(context))
+.of(&[V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

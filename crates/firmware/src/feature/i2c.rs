@@ -8,19 +8,21 @@
 
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusError, BusStatus, I2cConfig, Pin, Range};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_11,
-    DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Finished, Job, JobSlot, Object, Oid, Response,
-    command, only, response, since, until,
+    Back, Bus, Chip, Command, Context, Device, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Object, Oid,
+    Report, Response, Tolerance, command, response,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "I2C devices",
+
     commands: &[
-        CONFIG_I2C,
         CONFIG_I2C_WITH_BUS,
+        CONFIG_I2C,
         I2C_SET_BUS,
         I2C_SET_SOFTWARE_BUS,
         I2C_SET_SW_BUS,
@@ -32,7 +34,7 @@ pub(super) const FEATURE: Feature = Feature {
     responses: &[ReadResponse::FORM, TransferResponse::FORM],
     enumerations: &[
         Enumeration::new("i2c_bus", |board| board.i2c_buses()),
-        Enumeration::new("i2c_bus_status", |_| statuses()).of(since(Master)),
+        Enumeration::new("i2c_bus_status", |_| statuses()).of(&[Master]),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -57,15 +59,18 @@ shutdowns! {
     ODD_BITS = "i2c_modify_bits: Odd number of bits!";
 }
 
+/// The hosts whose messages have no status. Newer ones also look these messages up, and prefer them.
+const STOPS_ON_FAILURE: Hosts = Hosts::of(&[V0_11, V0_12, V0_13, Kalico]).unless(I2C_TRANSFER.format);
+
 response! {
     /// The bytes that a device sent.
-    "i2c_read_response oid=%c response=%*s" => until(V0_13).and(Kalico);
+    "i2c_read_response oid=%c response=%*s" => STOPS_ON_FAILURE;
     pub(super) struct ReadResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
 response! {
     /// The status of the bus, and the bytes that a device sent.
-    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => since(Master);
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => Hosts::of(&[Master]);
     pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
 }
 
@@ -92,7 +97,7 @@ fn statuses() -> Vec<Range> {
 
 /// The shutdown for a sensor that cannot be reached (Klipper's `i2c_shutdown_on_err`).
 pub(super) fn i2c_shutdown(context: &Context, error: BusError) -> Shutdown {
-    let reason = if context.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
+    let reason = if context.takes(&I2C_MODIFY_BITS) { I2C_READ_FAILED } else { on_wire(error.status).1 };
     Shutdown::because(reason, error.trouble)
 }
 
@@ -167,6 +172,8 @@ impl Job for Transfer {
     }
 }
 
+const KIND: &str = "I2C device";
+
 /// An I2C device.
 pub(super) struct I2c {
     bus: Option<Bus>,
@@ -176,18 +183,76 @@ pub(super) struct I2c {
     /// Whether the last transfer failed. Only the first failure is logged: an unplugged display fails many times a
     /// second.
     failing: bool,
+    /// The last answers, if the user tolerates failures.
+    tolerance: Option<(Tolerance, Answers)>,
+}
+
+/// The last answers of a device, to be repeated while it fails.
+#[derive(Default)]
+struct Answers(Vec<Answer>);
+
+struct Answer {
+    write: [u8; PAYLOAD_MAX],
+    write_len: usize,
+    read: [u8; u8::MAX as usize],
+    read_len: usize,
+}
+
+impl Answers {
+    /// Highest number of different questions.
+    const MAX: usize = 16;
+
+    fn new() -> Answers {
+        Answers(Vec::with_capacity(Answers::MAX))
+    }
+
+    fn place(&self, transfer: &Transfer) -> Option<usize> {
+        let written = &transfer.write[..transfer.write_len];
+        self.0
+            .iter()
+            .position(|answer| answer.read_len == transfer.read_len && &answer.write[..answer.write_len] == written)
+    }
+
+    /// Keeps an answer. Of too many different ones, the oldest is forgotten.
+    fn keep(&mut self, transfer: &Transfer) {
+        if transfer.read_len == 0 {
+            return;
+        }
+        let Transfer { write, write_len, read, read_len, .. } = *transfer;
+        if let Some(place) = self.place(transfer) {
+            self.0[place].read = read;
+            return;
+        }
+        if self.0.len() == Answers::MAX {
+            self.0.remove(0);
+        }
+        self.0.push(Answer { write, write_len, read, read_len });
+    }
+
+    /// Repeats the last answer to this question. False if there is none. A write to a device that is read has nothing
+    /// to repeat.
+    fn repeat(&self, transfer: &mut Transfer) -> bool {
+        match self.place(transfer) {
+            Some(place) => transfer.read = self.0[place].read,
+            None if transfer.read_len == 0 && !self.0.is_empty() => {}
+            None => return false,
+        }
+        true
+    }
 }
 
 impl I2c {
     fn new() -> I2c {
         let transfer = JobSlot::new(Transfer::new(Purpose::Transfer, &[], 0));
-        I2c { bus: None, on_lines: false, transfer, failing: false }
+        I2c { bus: None, on_lines: false, transfer, failing: false, tolerance: None }
     }
 
     fn set_bus(&mut self, context: &mut Context, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
         let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
         let opened = context.board()?.i2c(config)?;
         self.bus = Some(context.bus(opened)?);
+        let tolerance = context.tolerance(&Device::I2c(bus, config.address));
+        self.tolerance = tolerance.map(|tolerance| (tolerance, Answers::new()));
         Ok(())
     }
 
@@ -231,7 +296,7 @@ impl I2c {
     /// The shutdown for a failed transfer, depending on whether it was writing or reading.
     fn failure(&self, context: &Context, writing: bool, error: BusError) -> Shutdown {
         match writing {
-            _ if !context.serves(until(V0_12)) => i2c_shutdown(context, error),
+            _ if !context.takes(&I2C_MODIFY_BITS) => i2c_shutdown(context, error),
             _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.trouble),
             true => Shutdown::because(I2C_WRITE_FAILED, error.trouble),
             false => i2c_shutdown(context, error),
@@ -241,14 +306,30 @@ impl I2c {
 
 impl Object for I2c {
     fn kind(&self) -> &'static str {
-        "I2C device"
+        KIND
     }
 
     /// Reports the result of a transfer to the host. If the answer has no status, a failure stops the MCU.
     fn finished(&mut self, context: &mut Context, _number: u8, finished: Finished) -> Result<(), Shutdown> {
         let Some(Back { result, .. }) = self.transfer.back(finished) else { return Ok(()) };
-        let result = result.map_err(BusError::clone);
+        let mut result = result.map_err(BusError::clone);
         let Some(transfer) = self.transfer.here() else { return Ok(()) };
+        if let Some((tolerance, answers)) = &mut self.tolerance {
+            match &mut result {
+                Ok(()) => {
+                    answers.keep(transfer);
+                    tolerance.works(context, KIND, I2C_NACK);
+                }
+                Err(error) if !answers.repeat(transfer) => {
+                    error.trouble.remedy = Some("tolerate is only for a device that is read".into());
+                }
+                Err(error) => {
+                    if tolerance.bears(context, KIND, |context| i2c_shutdown(context, error.clone())) {
+                        result = Ok(());
+                    }
+                }
+            }
+        }
         let response = transfer.response();
         match (transfer.purpose, &result) {
             (Purpose::Transfer, result) => {
@@ -263,25 +344,30 @@ impl Object for I2c {
         if let Purpose::Transfer = transfer.purpose {
             if !failed_before {
                 let trouble = i2c_shutdown(context, error);
-                context.warn(self.kind(), trouble);
+                context.warn(KIND, trouble);
             }
             return Ok(());
         }
         // v0.11 wrote the register in a transfer of its own before the read.
         let of_register =
-            context.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
+            context.takes(&CONFIG_I2C_WITH_BUS) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
         let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
         let failure = self.failure(context, writing, error);
-        context.device_failed(self.kind(), failure)
+        context.device_failed(KIND, failure)
     }
 
     fn bus(&self) -> Option<&Bus> {
         self.bus.as_ref()
     }
+
+    fn report(&self) -> Report {
+        let repeats = self.tolerance.as_ref().is_some_and(|(tolerance, _)| tolerance.is_used());
+        Report { repeats, ..Report::default() }
+    }
 }
 
-const CONFIG_I2C: Command =
-    command!("config_i2c oid=%c", |context, oid: Oid| context.assign(oid, I2c::new())).of(since(V0_12));
+const CONFIG_I2C: Command = command!("config_i2c oid=%c", |context, oid: Oid| context.assign(oid, I2c::new()))
+    .of(&[V0_12, V0_13, Master, Kalico]);
 
 const CONFIG_I2C_WITH_BUS: Command = command!(
     "config_i2c oid=%c i2c_bus=%u rate=%u address=%u",
@@ -292,14 +378,14 @@ const CONFIG_I2C_WITH_BUS: Command = command!(
         context.assign(oid, i2c)
     }
 )
-.of(only(V0_11));
+.of(&[V0_11]);
 
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
     I2c,
     |i2c, context, i2c_bus: u32, rate: u32, address: u32| i2c.set_bus(context, i2c_bus, rate, address)
 )
-.of(since(V0_12));
+.of(&[V0_12, V0_13, Master, Kalico]);
 
 /// Half a period at 100 kHz. Klipper's C used this rate for every requested rate.
 const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
@@ -312,7 +398,7 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
         i2c.set_lines(context, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
     }
 )
-.of(since(V0_12).until(V0_13));
+.hosts(Hosts::of(&[V0_12, V0_13]).unless(I2C_SET_SW_BUS.format));
 
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
@@ -324,16 +410,16 @@ const I2C_SET_SW_BUS: Command = command!(
         address
     )
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", I2c, |i2c, context, data: &[u8]| i2c
     .transfer(context, Transfer::new(Purpose::Write, data, 0)))
-.of(until(V0_13).and(Kalico));
+.hosts(STOPS_ON_FAILURE);
 
 const I2C_READ: Command =
     command!("i2c_read oid=%c reg=%*s read_len=%u", I2c, |i2c, context, reg: &[u8], read_len: u32| i2c
         .transfer(context, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
-    .of(until(V0_13).and(Kalico));
+    .hosts(STOPS_ON_FAILURE);
 
 const I2C_MODIFY_BITS: Command = command!(
     "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
@@ -348,13 +434,13 @@ const I2C_MODIFY_BITS: Command = command!(
         i2c.transfer(context, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
     }
 )
-.of(until(V0_12));
+.of(&[V0_11, V0_12]);
 
 const I2C_TRANSFER: Command =
     command!("i2c_transfer oid=%c write=%*s read_len=%u", I2c, |i2c, context, write: &[u8], read_len: u32| {
         i2c.transfer(context, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 /// A count of bytes has one byte, as in Klipper's C.
 fn one_byte(count: u32) -> usize {

@@ -9,9 +9,10 @@
 use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Back, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Dialects, Enumeration,
-    Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, only, response, since,
+    Back, Chip, Command, Context, DialectName, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Next, Object, Oid,
+    Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -23,13 +24,17 @@ use super::trigger_analog::Attached;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "LDC1612 eddy current probes",
+
     commands: &[
         CONFIG_LDC1612,
         CONFIG_LDC1612_WITH_INTB,
         LDC1612_ATTACH_TRIGGER_ANALOG,
+        LDC1612_SETUP_HOME_WITHOUT_ERRORS,
         LDC1612_SETUP_HOME,
         QUERY_LDC1612_HOME_STATE,
         QUERY_LDC1612,
+        QUERY_LDC1612_STATUS,
         QUERY_STATUS_LDC1612,
     ],
     enumerations: &[Enumeration::new("ldc1612_error:", |_| {
@@ -40,17 +45,17 @@ pub(super) const FEATURE: Feature = Feature {
             ("INVALID_READ_DATA", INVALID_READ_DATA),
         ])
     })
-    .of(since(Master))],
+    .of(&[Master])],
     responses: &[HomeState::FORM],
     ..Feature::EMPTY
 };
 
 /// The hosts that home by the sensor itself. For them a failing bus stops the MCU.
-const HOMES_ITSELF: Dialects = only(V0_13).and(Kalico);
+const HOMES_ITSELF: &[DialectName] = &[V0_13, Kalico];
 
 response! {
     /// Whether samples are checked for homing, and when the trigger came.
-    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => HOMES_ITSELF;
+    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => Hosts::of(HOMES_ITSELF);
     pub(super) struct HomeState { oid: Oid, homing: bool, trigger_clock: Clock }
 }
 
@@ -140,7 +145,8 @@ struct Homing {
     /// A value above it is the trigger.
     threshold: u32,
     trigger_reason: u8,
-    error_reason: u8,
+    /// `None`: an error is a value as any other, and so is above the threshold.
+    error_reason: Option<u8>,
     /// Whether every sample so far was from before `clock`.
     awaits: bool,
     /// When homing begins. After the trigger: when it came.
@@ -149,14 +155,20 @@ struct Homing {
 
 impl Homing {
     /// Samples are not checked.
-    const OFF: Homing =
-        Homing { trsync: None, threshold: 0, trigger_reason: 0, error_reason: 0, awaits: false, clock: Clock::EPOCH };
+    const OFF: Homing = Homing {
+        trsync: None,
+        threshold: 0,
+        trigger_reason: 0,
+        error_reason: None,
+        awaits: false,
+        clock: Clock::EPOCH,
+    };
 
     /// Processes both words of channel 0, read at `at`.
     fn update(&mut self, context: &mut Context, words: u32, at: Clock) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
-        let reason = if words > DATA {
-            self.error_reason
+        let reason = if let (true, Some(reason)) = (words > DATA, self.error_reason) {
+            reason
         } else if self.awaits && at < self.clock {
             return Ok(());
         } else if words > self.threshold {
@@ -217,7 +229,7 @@ impl Ldc1612 {
     fn note(failing: &mut bool, context: &mut Context, failure: Option<&BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(failing, failure.is_some());
         let Some(error) = failure else { return Ok(()) };
-        let stops = context.serves(HOMES_ITSELF);
+        let stops = context.speaks::<HomeState>();
         if failed_before && !stops {
             return Ok(());
         }
@@ -254,7 +266,7 @@ impl Ldc1612 {
     /// Processes a sample: both words of channel 0, or an error.
     fn add(&mut self, context: &mut Context, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
         let sample = match words {
-            Ok(words) if looks_like_an_error(words) && !context.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
+            Ok(words) if looks_like_an_error(words) && !context.speaks::<HomeState>() => Err(INVALID_READ_DATA),
             words => words,
         };
         let sample = match sample {
@@ -272,6 +284,25 @@ impl Ldc1612 {
             }
         };
         self.bulk.add(context, &sample);
+        Ok(())
+    }
+
+    fn setup_home(
+        &mut self,
+        context: &mut Context,
+        clock: WireClock,
+        threshold: u32,
+        trsync_oid: Oid,
+        (trigger_reason, error_reason): (u8, Option<u8>),
+    ) -> Result<(), Shutdown> {
+        let clock = context.instant(clock);
+        if threshold == 0 {
+            self.homing.trsync = None;
+            return Ok(());
+        }
+        context.require::<Trsync>(trsync_oid)?;
+        let trsync = Some(trsync_oid);
+        self.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
         Ok(())
     }
 
@@ -332,37 +363,39 @@ impl Object for Ldc1612 {
 const CONFIG_LDC1612: Command = command!("config_ldc1612 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
     Ldc1612::configure(context, oid, i2c_oid, None)
 })
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const CONFIG_LDC1612_WITH_INTB: Command = command!(
     "config_ldc1612_with_intb oid=%c i2c_oid=%c intb_pin=%c",
     |context, oid: Oid, i2c_oid: Oid, intb_pin: Pin| { Ldc1612::configure(context, oid, i2c_oid, Some(intb_pin)) }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const LDC1612_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     Ldc1612,
     |sensor, context, trigger_analog_oid: Oid| sensor.attached.attach(context, trigger_analog_oid)
 )
-.of(since(Master));
+.of(&[Master]);
 
 const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
     Ldc1612,
     |sensor, context, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
-        let clock = context.instant(clock);
-        if threshold == 0 {
-            sensor.homing.trsync = None;
-            return Ok(());
-        }
-        context.require::<Trsync>(trsync_oid)?;
-        let trsync = Some(trsync_oid);
-        sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
-        Ok(())
+        sensor.setup_home(context, clock, threshold, trsync_oid, (trigger_reason, Some(error_reason)))
     }
 )
 .of(HOMES_ITSELF);
+
+/// The form of April and May 2024.
+const LDC1612_SETUP_HOME_WITHOUT_ERRORS: Command = command!(
+    "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c",
+    Ldc1612,
+    |sensor, context, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8| {
+        sensor.setup_home(context, clock, threshold, trsync_oid, (trigger_reason, None))
+    }
+)
+.of(&[]);
 
 const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", Ldc1612, |sensor, context| {
     let homing = &sensor.homing;
@@ -384,10 +417,15 @@ const QUERY_LDC1612: Command =
         let at = context.now() + rest_ticks;
         context.schedule(TIMER, at)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_STATUS_LDC1612: Command =
-    command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor.query_status(context)).of(since(V0_13));
+/// The name until June 2024.
+const QUERY_LDC1612_STATUS: Command =
+    command!("query_ldc1612_status oid=%c", Ldc1612, |sensor, context| sensor.query_status(context)).of(&[]);
+
+const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, context| sensor
+    .query_status(context))
+.of(&[V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -5,10 +5,8 @@
 //! "I2C operation").
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{
-    Command, DialectName::V0_12, DialectName::V0_13, Enumeration, Feature, Oid, Response, WireClock, command, only,
-    since,
-};
+use crate::mcu::DialectName::{Kalico, Master, V0_12, V0_13};
+use crate::mcu::{Command, Enumeration, Feature, Hosts, Oid, Response, WireClock, command};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
 
@@ -17,9 +15,13 @@ use super::named;
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "LIS2DW and LIS3DH accelerometers",
+
     commands: &[CONFIG_LIS2DW_ON_SPI, CONFIG_LIS2DW, QUERY_LIS2DW_AT, QUERY_LIS2DW, QUERY_LIS2DW_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
-    enumerations: &[Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)])).of(since(V0_13))],
+    enumerations: &[
+        Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)])).of(&[V0_13, Master, Kalico])
+    ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -31,7 +33,7 @@ shutdowns! {
 
 own_words! {
     "lis2dw_data oid=%c sequence=%hu data=%*s",
-    "lis2dw_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => only(V0_12);
+    "lis2dw_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => Hosts::of(&[V0_12]);
     data_max: BLOCK_BYTES, sample_bytes: SAMPLE_BYTES, fifo: u8
 }
 
@@ -140,7 +142,7 @@ type Sensor = FifoSensor<Lis2dw>;
 const CONFIG_LIS2DW_ON_SPI: Command = command!("config_lis2dw oid=%c spi_oid=%c", |context, oid: Oid, spi_oid: Oid| {
     configure(context, oid, spi_oid, Lis2dw { bus_type: BusType::Spi, model: Model::Lis2dw })
 })
-.of(only(V0_12));
+.of(&[V0_12]);
 
 const CONFIG_LIS2DW: Command = command!(
     "config_lis2dw oid=%c bus_oid=%c bus_oid_type=%c lis_chip_type=%c",
@@ -149,23 +151,24 @@ const CONFIG_LIS2DW: Command = command!(
         configure(context, oid, bus_oid, chip)
     }
 )
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const QUERY_LIS2DW_AT: Command = command!(
     "query_lis2dw oid=%c clock=%u rest_ticks=%u",
     Sensor,
     |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
-.of(only(V0_12));
+.of(&[V0_12]);
 
 const QUERY_LIS2DW: Command =
     command!("query_lis2dw oid=%c rest_ticks=%u", Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
-const QUERY_LIS2DW_STATUS: Command =
-    command!("query_lis2dw_status oid=%c", Sensor, |sensor, context| sensor.ask_status(context)).of(since(V0_12));
+const QUERY_LIS2DW_STATUS: Command = command!("query_lis2dw_status oid=%c", Sensor, |sensor, context| sensor
+    .ask_status(context))
+.of(&[V0_12, V0_13, Master, Kalico]);
 
 #[cfg(test)]
 mod tests {

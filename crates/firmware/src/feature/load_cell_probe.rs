@@ -3,10 +3,8 @@
 //! the host has set, it pulls a trsync. A sample outside the safe range, grams that overflow, and a silent sensor also
 //! pull it. Each has a reason of its own. (Klipper's `trigger_analog` developed from this.)
 
-use crate::mcu::{
-    Command, Context, DialectName::Kalico, Feature, Next, Object, Oid, Response, Timer, WireClock, command, response,
-    since,
-};
+use crate::mcu::DialectName::Kalico;
+use crate::mcu::{Command, Context, Feature, Hosts, Next, Object, Oid, Response, Timer, WireClock, command, response};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
@@ -14,6 +12,8 @@ use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "load cell probes",
+
     commands: &[CONFIG_LOAD_CELL_PROBE, LOAD_CELL_PROBE_SET_RANGE, LOAD_CELL_PROBE_HOME, LOAD_CELL_PROBE_QUERY_STATE],
     responses: &[State::FORM],
     shutdowns: SHUTDOWNS,
@@ -31,7 +31,7 @@ shutdowns! {
 
 response! {
     /// Whether the trigger came, and when.
-    "load_cell_probe_state oid=%c is_homing_trigger=%c trigger_ticks=%u" => since(Kalico);
+    "load_cell_probe_state oid=%c is_homing_trigger=%c trigger_ticks=%u" => Hosts::of(&[Kalico]);
     pub(super) struct State { oid: Oid, is_homing_trigger: bool, trigger_ticks: u32 }
 }
 
@@ -148,7 +148,7 @@ const CONFIG_LOAD_CELL_PROBE: Command =
         let limits = Limits::default();
         context.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
     })
-    .of(since(Kalico));
+    .of(&[Kalico]);
 
 const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
     "load_cell_probe_set_range oid=%c safety_counts_min=%i safety_counts_max=%i tare_counts=%i trigger_grams=%u grams_per_count=%i",
@@ -180,7 +180,7 @@ const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
         Ok(())
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const LOAD_CELL_PROBE_HOME: Command = command!(
     "load_cell_probe_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u rest_ticks=%u timeout=%u",
@@ -215,7 +215,7 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
         context.schedule(TIMER, begin)
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const LOAD_CELL_PROBE_QUERY_STATE: Command =
     command!("load_cell_probe_query_state oid=%c", LoadCellProbe, |probe, context| {
@@ -223,7 +223,7 @@ const LOAD_CELL_PROBE_QUERY_STATE: Command =
         context.send(State { oid: context.oid(), is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
         Ok(())
     })
-    .of(since(Kalico));
+    .of(&[Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -5,26 +5,29 @@
 //! Registers from their register maps (InvenSense, RM-MPU-9250A-00, rev. 1.6; DS-000189, rev. 1.3).
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{
-    Command, DialectName::V0_12, DialectName::V0_13, Feature, Oid, Response, WireClock, command, since, until,
-};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
+use crate::mcu::{Command, Feature, Hosts, Oid, Response, WireClock, command};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "MPU9250 and other MPU accelerometers",
     commands: &[CONFIG_MPU9250, QUERY_MPU9250_AT, QUERY_MPU9250, QUERY_MPU9250_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
     ..Feature::EMPTY
 };
 
-pub(super) const ICM20948: Feature =
-    Feature { commands: &[CONFIG_ICM20948, QUERY_ICM20948, QUERY_ICM20948_STATUS], ..Feature::EMPTY };
+pub(super) const ICM20948: Feature = Feature {
+    serves: "ICM20948 accelerometers",
+    commands: &[CONFIG_ICM20948, QUERY_ICM20948, QUERY_ICM20948_STATUS],
+    ..Feature::EMPTY
+};
 
 own_words! {
     "mpu9250_data oid=%c sequence=%hu data=%*s",
-    "mpu9250_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%u limit_count=%hu" => until(V0_12);
+    "mpu9250_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%u limit_count=%hu" => Hosts::of(&[V0_11, V0_12]);
     data_max: BLOCK_BYTES, sample_bytes: SAMPLE_BYTES, fifo: u32
 }
 
@@ -137,13 +140,13 @@ const QUERY_MPU9250_AT: Command = command!(
     Mpu9250Sensor,
     |sensor, context, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(context, clock, rest_ticks) }
 )
-.of(until(V0_12));
+.of(&[V0_11, V0_12]);
 
 const QUERY_MPU9250: Command =
     command!("query_mpu9250 oid=%c rest_ticks=%u", Mpu9250Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
 const QUERY_MPU9250_STATUS: Command =
     command!("query_mpu9250_status oid=%c", Mpu9250Sensor, |sensor, context| sensor.ask_status(context));
@@ -153,14 +156,14 @@ type Icm20948Sensor = FifoSensor<Icm20948>;
 const CONFIG_ICM20948: Command = command!("config_icm20948 oid=%c i2c_oid=%c", |context, oid: Oid, i2c_oid: Oid| {
     configure(context, oid, i2c_oid, Icm20948)
 })
-.of(since(V0_13));
+.of(&[V0_13, Master, Kalico]);
 
 const QUERY_ICM20948: Command =
     command!("query_icm20948 oid=%c rest_ticks=%u", Icm20948Sensor, |sensor, context, rest_ticks: Ticks| {
         sensor.query(context, rest_ticks)
     })
-    .of(since(V0_13));
+    .of(&[V0_13, Master, Kalico]);
 
 const QUERY_ICM20948_STATUS: Command =
     command!("query_icm20948_status oid=%c", Icm20948Sensor, |sensor, context| sensor.ask_status(context))
-        .of(since(V0_13));
+        .of(&[V0_13, Master, Kalico]);

@@ -20,6 +20,8 @@ mod line;
 mod spi;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "neopixels",
+
     commands: &[CONFIG_NEOPIXEL, NEOPIXEL_UPDATE, NEOPIXEL_SEND],
     responses: &[Sent::FORM],
     shutdowns: SHUTDOWNS,

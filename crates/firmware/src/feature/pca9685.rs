@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Remote, Safe, Settable, Timer,
-    WireClock, command,
+    BusCounts, Calls, Command, Constant, Context, Device, Feature, Finished, Next, Object, Oid, Remote, Safe, Settable,
+    Timer, WireClock, command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -16,6 +16,8 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "PCA9685 outputs",
+
     commands: &[CONFIG_PCA9685, QUEUE_PCA9685_OUT, SET_PCA9685_OUT],
     constants: &[Constant::number("PCA9685_MAX", VALUE_MAX as u32)],
     shutdowns: SHUTDOWNS,
@@ -326,6 +328,11 @@ const CONFIG_PCA9685: Command = command!(
      max_duration: Ticks| {
         context.vacant(oid)?;
         check(channel, &[value, default_value])?;
+        let device = Device::I2c(bus.into(), addr);
+        if context.tolerance(&device).is_some() {
+            let cause = format_args!("failures of {device} are tolerated, but outputs are not read");
+            return Err(Shutdown::because(NOT_SET_UP, cause.to_string()).remedy("remove it from tolerate"));
+        }
         let own = context.own::<Chips>();
         let place = context.with::<Chips, _>(own, |chips, context| {
             let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;

@@ -14,6 +14,8 @@ use super::set_too_late;
 use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "hardware PWM",
+
     commands: &[CONFIG_PWM_OUT, QUEUE_PWM_OUT, SET_PWM_OUT],
     constants: &[Constant::number("PWM_MAX", PWM_MAX as u32)],
     shutdowns: SHUTDOWNS,
@@ -94,7 +96,7 @@ impl Object for PwmOut {
     }
 
     fn report(&self) -> Report {
-        Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)) }
+        Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)), ..Report::default() }
     }
 
     fn counts(&self) -> Option<BusCounts> {

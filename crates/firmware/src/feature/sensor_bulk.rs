@@ -9,21 +9,26 @@
 //!
 //! Up to v0.12 each sensor had its own messages for this ([`Words`]). They are in the sensor's file.
 
-use crate::mcu::{Context, DialectName::V0_13, Feature, Oid, Response, response, since};
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
+use crate::mcu::{Context, Feature, Hosts, Oid, Response, response};
 use crate::time::Clock;
 
-pub(super) const FEATURE: Feature = Feature { responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    serves: "accelerometers, angle sensors, load cells and eddy current probes",
+    responses: &[BulkData::FORM, BulkStatus::FORM],
+    ..Feature::EMPTY
+};
 
 response! {
     /// Samples, packed in the format of the sensor's klippy module.
-    "sensor_bulk_data oid=%c sequence=%hu data=%*s" => since(V0_13);
+    "sensor_bulk_data oid=%c sequence=%hu data=%*s" => BulkStatus::FORM.hosts.with(BulkStatus::FORM.format);
     pub(super) struct BulkData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
 }
 
 response! {
     /// How many samples there were between `clock` and `clock + query_ticks`: `next_sequence` messages, and `buffered`
     /// bytes that are not sent yet.
-    "sensor_bulk_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%u possible_overflows=%hu" => since(V0_13);
+    "sensor_bulk_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%u possible_overflows=%hu" => Hosts::of(&[V0_13, Master, Kalico]);
     pub(super) struct BulkStatus {
         oid: Oid,
         clock: Clock,
@@ -70,7 +75,7 @@ macro_rules! own_words {
     ) => {
         $crate::response! {
             /// Samples.
-            $data => $hosts;
+            $data => $hosts.with($status);
             pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
         }
 

@@ -4,10 +4,13 @@
 //! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals
 //! the result of Klipper's C to the bit, even if its 32-bit sums wrap.
 
-use crate::mcu::{Command, DialectName::Kalico, DialectName::Master, Feature, Object, Oid, command, since};
+use crate::mcu::DialectName::{Kalico, Master};
+use crate::mcu::{Command, Feature, Object, Oid, command};
 use crate::shutdown::{Shutdown, shutdowns};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "load cell probes",
+
     commands: &[
         CONFIG_SOS_FILTER,
         SOS_FILTER_SET_SECTION,
@@ -162,7 +165,7 @@ const CONFIG_SOS_FILTER: Command =
     command!("config_sos_filter oid=%c max_sections=%c", |context, oid: Oid, max_sections: u8| {
         context.assign(oid, SosFilter::new(max_sections))
     })
-    .of(since(Master).and(Kalico));
+    .of(&[Master, Kalico]);
 
 const SOS_FILTER_SET_SECTION: Command = command!(
     "sos_filter_set_section oid=%c section_idx=%c sos0=%i sos1=%i sos2=%i sos3=%i sos4=%i",
@@ -172,7 +175,7 @@ const SOS_FILTER_SET_SECTION: Command = command!(
         Ok(())
     }
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const SOS_FILTER_SET_STATE: Command = command!(
     "sos_filter_set_state oid=%c section_idx=%c state0=%i state1=%i",
@@ -182,7 +185,7 @@ const SOS_FILTER_SET_STATE: Command = command!(
         Ok(())
     }
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
     "sos_filter_set_offset_scale oid=%c offset=%i scale=%i scale_frac_bits=%c auto_offset=%c",
@@ -195,14 +198,14 @@ const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
         Ok(())
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const SOS_FILTER_SET_ACTIVE: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_frac_bits=%c",
     SosFilter,
     |filter, _, n_sections: u8, coeff_frac_bits: u8| filter.activate(n_sections, coeff_frac_bits)
 )
-.of(since(Master));
+.of(&[Master]);
 
 const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_int_bits=%c",
@@ -213,7 +216,7 @@ const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
         filter.activate(n_sections, coeff_frac_bits)
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 #[cfg(test)]
 mod tests {

@@ -12,16 +12,20 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusError, ChipSelect, Pin, SpiConfig};
+use crate::mcu::DialectName::{Kalico, Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Bus, Chip, Command, Context, DialectName::Kalico, DialectName::Master, DialectName::V0_13, Enumeration,
-    Feature, Finished, Job, JobSlot, Object, Oid, Response, Safe, command, response, since, until,
+    Back, Bus, Chip, Command, Context, Enumeration, Feature, Finished, Hosts, Job, JobSlot, Object, Oid, Response,
+    Safe, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "SPI devices",
+
     commands: &[
+        CONFIG_SPI_OF_V0_10,
         CONFIG_SPI,
         CONFIG_SPI_WITHOUT_CS,
         SPI_SET_BUS,
@@ -314,12 +318,19 @@ impl Object for SpiShutdown {
     }
 }
 
+fn configure(context: &mut Context, oid: Oid, pin: Pin, active_high: bool) -> Result<(), Shutdown> {
+    context.vacant(oid)?;
+    let line = context.shared_output(pin, !active_high)?;
+    let chip_select = ChipSelect { line, active_high, clock: context.clock() };
+    context.assign_on(pin, oid, Spi::new(Some(chip_select)))
+}
+
+const CONFIG_SPI_OF_V0_10: Command =
+    command!("config_spi oid=%c pin=%u", |context, oid: Oid, pin: Pin| configure(context, oid, pin, false)).of(&[]);
+
 const CONFIG_SPI: Command =
     command!("config_spi oid=%c pin=%u cs_active_high=%c", |context, oid: Oid, pin: Pin, cs_active_high: bool| {
-        context.vacant(oid)?;
-        let line = context.shared_output(pin, !cs_active_high)?;
-        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: context.clock() };
-        context.assign_on(pin, oid, Spi::new(Some(chip_select)))
+        configure(context, oid, pin, cs_active_high)
     });
 
 const CONFIG_SPI_WITHOUT_CS: Command =
@@ -346,7 +357,7 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
         spi.set_lines(context, pins, mode, pulse)
     }
 )
-.of(until(V0_13));
+.hosts(Hosts::of(&[V0_11, V0_12, V0_13]).unless(SPI_SET_SW_BUS.format));
 
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
@@ -358,7 +369,7 @@ const SPI_SET_SW_BUS: Command = command!(
         spi.set_lines(context, pins, mode, pulse_ticks)
     }
 )
-.of(since(Master).and(Kalico));
+.of(&[Master, Kalico]);
 
 const SPI_TRANSFER: Command =
     command!("spi_transfer oid=%c data=%*s", Spi, |spi, context, data: &[u8]| spi.transfer(context, true, data));

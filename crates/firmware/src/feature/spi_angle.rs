@@ -5,9 +5,10 @@
 //! when each was due. An entry says by how much it came later (for the TLE5012B: the chip's own clock). A sensor gets
 //! one request at a time. Its latched measurement is read before a transfer of the host latches a new one.
 
+use crate::mcu::DialectName::{Master, V0_11, V0_12, V0_13};
 use crate::mcu::{
-    Back, Command, Context, DialectName::Kalico, DialectName::V0_12, DialectName::V0_13, Dialects, Enumeration,
-    Feature, Finished, Hold, JobSlot, Next, Object, Oid, Response, Timer, WireClock, command, response, until,
+    Back, Command, Context, DialectName, Enumeration, Feature, Finished, Hold, Hosts, JobSlot, Next, Object, Oid,
+    Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -17,18 +18,20 @@ use super::sensor_bulk::{BulkData, SensorBulk, Status, Words};
 use super::spi::{Spi, Transfer, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "angle sensors",
+
     commands: &[CONFIG_SPI_ANGLE, QUERY_SPI_ANGLE, SPI_ANGLE_TRANSFER],
     responses: &[OwnData::FORM, OwnEnd::FORM, TransferResponse::FORM],
     enumerations: &[
-        Enumeration::new("spi_angle_type", |_| named(&TYPES[..TYPES_OF_V0_12])).of(until(V0_12)),
-        Enumeration::new("spi_angle_type", |_| named(&TYPES)).of(KNOWN.since(V0_13)),
+        Enumeration::new("spi_angle_type", |_| named(&TYPES[..TYPES_OF_V0_12])).of(&[V0_11, V0_12]),
+        Enumeration::new("spi_angle_type", |_| named(&TYPES)).of(&[V0_13, Master]),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
 
 /// The hosts that know these sensors. Kalico has them only for other boards.
-const KNOWN: Dialects = Dialects::ALL.except(Kalico);
+const KNOWN: &[DialectName] = &[V0_11, V0_12, V0_13, Master];
 
 const TYPES: [(&str, u8); 5] = [("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)];
 /// How many of them v0.12 knows.
@@ -43,13 +46,13 @@ shutdowns! {
 
 response! {
     /// Entries.
-    "spi_angle_data oid=%c sequence=%hu data=%*s" => until(V0_12);
+    "spi_angle_data oid=%c sequence=%hu data=%*s" => OwnEnd::FORM.hosts.with(OwnEnd::FORM.format);
     pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
 }
 
 response! {
     /// The measurements have ended. The last message has the number before this one.
-    "spi_angle_end oid=%c sequence=%hu" => until(V0_12);
+    "spi_angle_end oid=%c sequence=%hu" => Hosts::of(&[V0_11, V0_12]);
     pub(super) struct OwnEnd { oid: Oid, sequence: u16 }
 }
 
@@ -62,7 +65,7 @@ const OWN_WORDS: Words = Words {
 
 response! {
     /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow for a time.
-    "spi_angle_transfer_response oid=%c clock=%u response=%*s" => KNOWN;
+    "spi_angle_transfer_response oid=%c clock=%u response=%*s" => Hosts::of(KNOWN);
     pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
 }
 

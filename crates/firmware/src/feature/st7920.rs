@@ -13,8 +13,11 @@ use crate::time::Ticks;
 use super::display::{Busy, Display, Panel, Register, Wire, hold};
 use super::pace::Pace;
 
-pub(super) const FEATURE: Feature =
-    Feature { commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    serves: "ST7920 displays",
+    commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA],
+    ..Feature::EMPTY
+};
 
 /// Shortest time that SCLK is high, and low: 200 ns.
 const HALF_CLOCK: Ticks = Ticks(10);

@@ -5,9 +5,10 @@
 use std::ops::Range;
 
 use crate::board::Pin;
+use crate::mcu::DialectName::{Kalico, Master, V0_13};
 use crate::mcu::{
-    Batch, Command, Constant, Context, DialectName::Kalico, DialectName::V0_13, Feature, MoveQueue, Next, Object, Oid,
-    Present, PromptLine, Report, Response, SPIN_MAX, Timer, WireClock, command, response, since,
+    Batch, Command, Constant, Context, Feature, MoveQueue, Next, Object, Oid, Present, PromptLine, Report, Response,
+    SPIN_MAX, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -15,7 +16,10 @@ use crate::time::{Clock, Ticks};
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "steppers",
+
     commands: &[
+        CONFIG_STEPPER_OF_V0_10,
         CONFIG_STEPPER,
         QUEUE_STEP,
         QUEUE_STEP_HP,
@@ -25,7 +29,7 @@ pub(super) const FEATURE: Feature = Feature {
         STEPPER_STOP_ON_TRIGGER,
     ],
     responses: &[Position::FORM],
-    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1).of(since(V0_13))],
+    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1).of(&[V0_13, Master, Kalico])],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -337,39 +341,60 @@ impl Object for Stepper {
 
     fn report(&self) -> Report {
         let position = self.position().wrapping_sub(POSITION_BIAS) as i32;
-        Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
+        Report { queued: self.queue.len(), value: Some(Present::Steps(position)), ..Report::default() }
     }
 }
+
+fn configure(
+    context: &mut Context,
+    oid: Oid,
+    [step_pin, dir_pin]: [Pin; 2],
+    invert_step: i8,
+    step_pulse_ticks: Ticks,
+) -> Result<(), Shutdown> {
+    context.vacant(oid)?;
+    let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
+    // After a step on either edge, a stop leaves the level: another edge would be another step.
+    let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
+    let dir = context.prompt_output(dir_pin, "dir", false, false)?;
+    let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
+    let stepper = Stepper {
+        step,
+        dir,
+        idle_step,
+        edges_back: u32::from(!both_edges),
+        pulse_ticks,
+        late_limit: context.step_late_limit(),
+        queue: MoveQueue::default(),
+        edges: 0,
+        intervals: Intervals::default(),
+        next_step: Clock::EPOCH,
+        earliest: Clock::EPOCH,
+        reverse_pending: false,
+        position: POSITION_BIAS.wrapping_neg(),
+        last_dir: false,
+        next_dir: false,
+        need_reset: false,
+        stopper: None,
+    };
+    context.assign_on(step_pin, oid, stepper)
+}
+
+/// How long a step pulse is at least with hosts that do not say it (`STEP_DELAY`).
+const STEP_PULSE: Ticks = Ticks::from_us(2);
+
+const CONFIG_STEPPER_OF_V0_10: Command = command!(
+    "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c",
+    |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: bool| {
+        configure(context, oid, [step_pin, dir_pin], invert_step.into(), STEP_PULSE)
+    }
+)
+.of(&[]);
 
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
     |context, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
-        context.vacant(oid)?;
-        let (idle_step, both_edges) = (invert_step > 0, invert_step < 0);
-        // After a step on either edge, a stop leaves the level: another edge would be another step.
-        let step = context.prompt_output(step_pin, "step", idle_step, both_edges)?;
-        let dir = context.prompt_output(dir_pin, "dir", false, false)?;
-        let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
-        let stepper = Stepper {
-            step,
-            dir,
-            idle_step,
-            edges_back: u32::from(!both_edges),
-            pulse_ticks,
-            late_limit: context.step_late_limit(),
-            queue: MoveQueue::default(),
-            edges: 0,
-            intervals: Intervals::default(),
-            next_step: Clock::EPOCH,
-            earliest: Clock::EPOCH,
-            reverse_pending: false,
-            position: POSITION_BIAS.wrapping_neg(),
-            last_dir: false,
-            next_dir: false,
-            need_reset: false,
-            stopper: None,
-        };
-        context.assign_on(step_pin, oid, stepper)
+        configure(context, oid, [step_pin, dir_pin], invert_step, step_pulse_ticks)
     }
 );
 
@@ -396,7 +421,7 @@ const QUEUE_STEP_HP: Command = command!(
         stepper.queue(context, Move { interval, count, add, add2, shift: shift as i8, reverses: false })
     }
 )
-.of(since(Kalico));
+.of(&[Kalico]);
 
 const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", Stepper, |stepper, _, dir: bool| {
     stepper.next_dir = dir;

@@ -5,17 +5,20 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Back, Command, Context, DialectName::Kalico, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid,
-    Response, Timer, WireClock, command, response, since,
+    Back, Command, Context, Enumeration, Feature, Finished, Job, JobSlot, Next, Object, Oid, Response, Timer,
+    WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 use crate::trouble::Trouble;
 
+use super::ds18b20::CONFIG_DS18B20_OF_KALICO;
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
-    commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE],
+    serves: "MAX31855, MAX31856, MAX31865 and MAX6675 sensors",
+
+    commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE_AT_ONCE, QUERY_THERMOCOUPLE],
     responses: &[Reading::FORM],
     enumerations: &[Enumeration::new("thermocouple_type", types)],
     shutdowns: SHUTDOWNS,
@@ -156,9 +159,30 @@ struct Thermocouple {
 }
 
 impl Thermocouple {
+    fn query(
+        &mut self,
+        context: &mut Context,
+        clock: WireClock,
+        rest_ticks: Ticks,
+        (min_value, max_value): (u32, u32),
+        max_invalid_count: u8,
+    ) -> Result<(), Shutdown> {
+        let at = context.instant(clock);
+        context.cancel(TIMER);
+        self.read.drop_pending();
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
+        self.rest_ticks = rest_ticks;
+        (self.min_value, self.max_value) = (min_value, max_value);
+        self.max_invalid_count = max_invalid_count;
+        self.invalid_count = 0;
+        context.schedule(TIMER, at)
+    }
+
     fn check(&mut self, context: &Context, value: u32, fault: u8) -> Result<(), Shutdown> {
         // This is Kalico's way to say that only the host checks the values.
-        if self.max_invalid_count == 0 && context.serves(since(Kalico)) {
+        if self.max_invalid_count == 0 && context.takes(&CONFIG_DS18B20_OF_KALICO) {
             return Ok(());
         }
         if fault == 0 && (self.min_value..=self.max_value).contains(&value) {
@@ -241,20 +265,19 @@ const QUERY_THERMOCOUPLE: Command = command!(
     "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u max_invalid_count=%c",
     Thermocouple,
     |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
-        let at = context.instant(clock);
-        context.cancel(TIMER);
-        sensor.read.drop_pending();
-        if rest_ticks == Ticks(0) {
-            return Ok(());
-        }
-        sensor.rest_ticks = rest_ticks;
-        sensor.min_value = min_value;
-        sensor.max_value = max_value;
-        sensor.max_invalid_count = max_invalid_count;
-        sensor.invalid_count = 0;
-        context.schedule(TIMER, at)
+        sensor.query(context, clock, rest_ticks, (min_value, max_value), max_invalid_count)
     }
 );
+
+/// The form before September 2022. The first value outside the limits stops the MCU.
+const QUERY_THERMOCOUPLE_AT_ONCE: Command = command!(
+    "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u",
+    Thermocouple,
+    |sensor, context, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32| {
+        sensor.query(context, clock, rest_ticks, (min_value, max_value), 1)
+    }
+)
+.of(&[]);
 
 #[cfg(test)]
 mod tests {

@@ -20,6 +20,8 @@ mod lines;
 mod port;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "TMC drivers on a UART",
+
     commands: &[CONFIG_TMCUART, TMCUART_SEND],
     responses: &[UartResponse::FORM],
     shutdowns: SHUTDOWNS,

@@ -3,9 +3,9 @@
 //! host's value. Samples out of range, a filter overflow, an error of the sensor and a silent sensor also pull it. Each
 //! has a reason of its own.
 
+use crate::mcu::DialectName::Master;
 use crate::mcu::{
-    Command, Context, DialectName::Master, Enumeration, Feature, Next, Object, Oid, Response, Timer, WireClock,
-    command, response, since,
+    Command, Context, Enumeration, Feature, Hosts, Next, Object, Oid, Response, Timer, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -16,6 +16,8 @@ use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "load cell probes and eddy current probes",
+
     commands: &[
         CONFIG_TRIGGER_ANALOG,
         TRIGGER_ANALOG_SET_RAW_RANGE,
@@ -23,10 +25,10 @@ pub(super) const FEATURE: Feature = Feature {
         TRIGGER_ANALOG_HOME,
         TRIGGER_ANALOG_QUERY_STATE,
     ],
-    responses: &[State::FORM],
+    responses: &[StateWithTrigger::FORM, State::FORM],
     enumerations: &[
         Enumeration::new("trigger_analog_type", |_| named(&TriggerType::ALL.map(|(type_, name)| (name, type_ as u8))))
-            .of(since(Master)),
+            .of(&[Master]),
         Enumeration::new("trigger_analog_error:", |_| {
             named(&[
                 ("RAW_RANGE", RAW_RANGE),
@@ -35,7 +37,7 @@ pub(super) const FEATURE: Feature = Feature {
                 ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
             ])
         })
-        .of(since(Master)),
+        .of(&[Master]),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -47,8 +49,14 @@ shutdowns! {
 }
 
 response! {
+    /// The form of 25 to 29 January 2026: when the sample came that decided, which is the peak before a tap.
+    "trigger_analog_state oid=%c homing=%c trigger_clock=%u" => Hosts::of(&[]);
+    pub(super) struct StateWithTrigger { oid: Oid, homing: bool, trigger_clock: Clock }
+}
+
+response! {
     /// Whether samples are checked, and when the trigger came.
-    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => since(Master);
+    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => Hosts::of(&[Master]);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
@@ -103,6 +111,8 @@ pub(super) struct TriggerAnalog {
     awaits: bool,
     /// When homing begins. After the trigger: when it came.
     homing_clock: Clock,
+    /// When the last sample came that may be the trigger. For [`TriggerType::DiffPeakGt`]: when the peak came.
+    trigger_clock: Clock,
     trsync: Option<Oid>,
     trigger_reason: u8,
     error_reason: u8,
@@ -126,7 +136,7 @@ impl TriggerAnalog {
         let Ok(value) = context.with::<SosFilter, _>(self.filter, |filter, _| Ok(filter.apply(sample)))? else {
             return self.fail(context, OVERFLOW);
         };
-        if !self.crosses(value) {
+        if !self.crosses(value, at) {
             return Ok(());
         }
         self.homing = false;
@@ -136,7 +146,10 @@ impl TriggerAnalog {
 
     /// Whether a filtered value pulls the trigger. Klipper's C compares a negative trigger value as unsigned, except
     /// for [`TriggerType::Gt`].
-    fn crosses(&mut self, value: i32) -> bool {
+    fn crosses(&mut self, value: i32, at: Clock) -> bool {
+        if self.trigger_type != TriggerType::DiffPeakGt || value > self.peak {
+            self.trigger_clock = at;
+        }
         match self.trigger_type {
             TriggerType::AbsGe => value.unsigned_abs() >= self.trigger_value as u32,
             TriggerType::Gt => value > self.trigger_value,
@@ -244,6 +257,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
             homing: false,
             awaits: false,
             homing_clock: Clock::EPOCH,
+            trigger_clock: Clock::EPOCH,
             trsync: None,
             trigger_reason: 0,
             error_reason: 0,
@@ -253,7 +267,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
         };
         context.assign(oid, trigger)
     })
-    .of(since(Master));
+    .of(&[Master]);
 
 const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
     "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
@@ -264,7 +278,7 @@ const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
         Ok(())
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
@@ -275,7 +289,7 @@ const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
         Ok(())
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
@@ -310,11 +324,14 @@ const TRIGGER_ANALOG_HOME: Command = command!(
         context.schedule(TIMER, at)
     }
 )
-.of(since(Master));
+.of(&[Master]);
 
 const TRIGGER_ANALOG_QUERY_STATE: Command =
     command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, context| {
-        context.send(State { oid: context.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
+        let (oid, homing) = (context.oid(), trigger.homing);
+        context.send(State { oid, homing, homing_clock: trigger.homing_clock });
+        // The dictionary has one of both.
+        context.send(StateWithTrigger { oid, homing, trigger_clock: trigger.trigger_clock });
         Ok(())
     })
-    .of(since(Master));
+    .of(&[Master]);

@@ -6,6 +6,8 @@ use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
 pub(super) const FEATURE: Feature = Feature {
+    serves: "homing",
+
     commands: &[CONFIG_TRSYNC, TRSYNC_START, TRSYNC_SET_TIMEOUT, TRSYNC_TRIGGER],
     responses: &[State::FORM],
     shutdowns: SHUTDOWNS,

@@ -5,10 +5,11 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
 
 use super::stats::SUMSQ_BASE;
-use super::{Command, Constant, Dialects, Enumeration, Feature, Form, Response, command, response};
+use super::{Command, Constant, Enumeration, Feature, Form, Hosts, Response, command, response};
 
 /// This file's entries in the dictionary.
 pub const FEATURE: Feature = Feature {
+    serves: "every printer",
     commands: &[
         IDENTIFY,
         GET_CLOCK,
@@ -40,6 +41,7 @@ const RESPONSES: &[Form] = &[
     IdentifyResponse::FORM,
     ClockResponse::FORM,
     Uptime::FORM,
+    ConfigOfV010::FORM,
     Config::FORM,
     Starting::FORM,
     ShutdownReport::FORM,
@@ -47,7 +49,7 @@ const RESPONSES: &[Form] = &[
     Stats::FORM,
     Pong::FORM,
     // Never sent, because `debug_read` is refused. Klipper's dictionary has it.
-    Form { format: "debug_result val=%u", dialects: Dialects::ALL },
+    Form { format: "debug_result val=%u", hosts: Hosts::ALL },
 ];
 
 /// How many bytes the host may send before an acknowledgement. It is half of a pty's buffer of 4096 bytes. So the
@@ -92,6 +94,18 @@ response! {
     /// Whether the MCU is configured, and the checksum of that configuration, as the host gave it.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
+}
+
+response! {
+    /// The same in the order of hosts before November 2021.
+    "config is_config=%c crc=%u move_count=%hu is_shutdown=%c" => Hosts::of(&[]);
+    pub struct ConfigOfV010 { is_config: bool, crc: u32, move_count: u16, is_shutdown: bool }
+}
+
+impl From<Config> for ConfigOfV010 {
+    fn from(Config { is_config, crc, is_shutdown, move_count }: Config) -> ConfigOfV010 {
+        ConfigOfV010 { is_config, crc, move_count, is_shutdown }
+    }
 }
 
 impl Config {
@@ -175,8 +189,9 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu: &mut Mcu| {
 .allowed_in_shutdown();
 
 const GET_CONFIG: Command = command!("get_config", |mcu: &mut Mcu| {
-    let config = mcu.config();
-    mcu.state.wire.send(config);
+    mcu.state.wire.send(mcu.config());
+    // The dictionary has one of both.
+    mcu.state.wire.send(ConfigOfV010::from(mcu.config()));
     Ok(())
 })
 .allowed_in_shutdown();

@@ -8,7 +8,7 @@ use pinion_protocol::Malformed;
 use pinion_protocol::format::same;
 use pinion_protocol::vlq::{Reader, Writer};
 
-use super::{Dialects, Mcu, Wire};
+use super::{DialectName, Hosts, Mcu, Wire};
 
 impl From<Malformed> for Shutdown {
     /// The cause is empty. [`Mcu::execute`] adds the name of the command.
@@ -26,7 +26,7 @@ pub struct Command {
     /// Name, parameters and their conversions, exactly as klippy looks them up.
     pub format: &'static str,
     /// The hosts that use this form.
-    pub dialects: Dialects,
+    pub hosts: Hosts,
     /// Whether it also runs after a shutdown.
     pub in_shutdown: bool,
     /// Whether it may join a command of the same kind: see [`Command::joining`].
@@ -38,7 +38,7 @@ pub struct Command {
 impl Command {
     /// A command for all hosts that runs while the MCU is not stopped. [`command!`](crate::command) declares one.
     pub const fn new(format: &'static str, handler: Handler) -> Command {
-        Command { format, dialects: Dialects::ALL, in_shutdown: false, joins: false, handler }
+        Command { format, hosts: Hosts::ALL, in_shutdown: false, joins: false, handler }
     }
 
     /// Lets the command run after a shutdown too (`HF_IN_SHUTDOWN`).
@@ -54,10 +54,14 @@ impl Command {
         self
     }
 
-    /// The hosts that use this form: [`since`](super::since), [`until`](super::until) or [`only`](super::only). Without
-    /// this, all hosts use it.
-    pub const fn of(mut self, dialects: Dialects) -> Command {
-        self.dialects = dialects;
+    /// The dialects that have this form. Without this, all have it. Hosts that look it up get it anyway.
+    pub const fn of(self, dialects: &'static [DialectName]) -> Command {
+        self.hosts(Hosts::of(dialects))
+    }
+
+    /// The hosts that use this form. Without this, all do.
+    pub const fn hosts(mut self, hosts: Hosts) -> Command {
+        self.hosts = hosts;
         self
     }
 }
@@ -67,7 +71,7 @@ pub struct Form {
     /// Name, parameters and their conversions.
     pub format: &'static str,
     /// The hosts that use this form.
-    pub dialects: Dialects,
+    pub hosts: Hosts,
 }
 
 /// A message to the host.
@@ -87,7 +91,7 @@ pub struct Constant {
     /// Its value.
     pub value: ConstantValue,
     /// The hosts whose dictionary has it.
-    pub dialects: Dialects,
+    pub hosts: Hosts,
 }
 
 /// The value of a constant.
@@ -101,17 +105,17 @@ pub enum ConstantValue {
 impl Constant {
     /// A constant that is a number.
     pub const fn number(name: &'static str, number: u32) -> Constant {
-        Constant { name, value: ConstantValue::Number(number), dialects: Dialects::ALL }
+        Constant { name, value: ConstantValue::Number(number), hosts: Hosts::ALL }
     }
 
     /// A constant that is a text.
     pub const fn text(name: &'static str, text: &'static str) -> Constant {
-        Constant { name, value: ConstantValue::Text(text), dialects: Dialects::ALL }
+        Constant { name, value: ConstantValue::Text(text), hosts: Hosts::ALL }
     }
 
-    /// The hosts whose dictionary has it. Without this, all do.
-    pub const fn of(mut self, dialects: Dialects) -> Constant {
-        self.dialects = dialects;
+    /// The dialects whose dictionary has it. Without this, all do. Hosts that look it up get it anyway.
+    pub const fn of(mut self, dialects: &'static [DialectName]) -> Constant {
+        self.hosts = Hosts::of(dialects);
         self
     }
 }
@@ -123,27 +127,29 @@ pub struct Enumeration {
     /// The names on this board, and their values.
     pub values: fn(&dyn Board) -> Vec<Range>,
     /// The hosts whose dictionary has it.
-    pub dialects: Dialects,
+    pub hosts: Hosts,
 }
 
 impl Enumeration {
     /// An enumeration.
     pub const fn new(name: &'static str, values: fn(&dyn Board) -> Vec<Range>) -> Enumeration {
-        Enumeration { name, values, dialects: Dialects::ALL }
+        Enumeration { name, values, hosts: Hosts::ALL }
     }
 
-    /// The hosts whose dictionary has it with these values. Without this, all do.
-    pub const fn of(mut self, dialects: Dialects) -> Enumeration {
-        self.dialects = dialects;
+    /// The dialects whose dictionary has it with these values. Without this, all do. Hosts that look it up get it anyway.
+    pub const fn of(mut self, dialects: &'static [DialectName]) -> Enumeration {
+        self.hosts = Hosts::of(dialects);
         self
     }
 }
 
 /// A feature's entries in the dictionary. [`Feature::EMPTY`] provides the fields that a feature does not need.
 pub struct Feature {
-    /// Its commands.
+    /// The part of a printer that it serves, in words of printer.cfg.
+    pub serves: &'static str,
+    /// Its commands. Of the forms of a name, the oldest comes first.
     pub commands: &'static [Command],
-    /// Its responses.
+    /// Its responses. Of the forms of a name, the oldest comes first.
     pub responses: &'static [Form],
     /// Its constants.
     pub constants: &'static [Constant],
@@ -158,6 +164,7 @@ pub struct Feature {
 impl Feature {
     /// A feature that adds nothing.
     pub const EMPTY: Feature = Feature {
+        serves: "",
         commands: &[],
         responses: &[],
         constants: &[],
@@ -218,12 +225,12 @@ macro_rules! command {
     };
 }
 
-/// Declares a response as a struct. The hosts that use it follow the format, for example `=> until(V0_12);`. Without
-/// them, all hosts use it. The parent module must have a `response_index` that finds the format in the list of
+/// Declares a response as a struct. The [`Hosts`] that use it follow the format, for example
+/// `=> Hosts::of(&[V0_11, V0_12]);`. Without them, all hosts use it. The parent module must have a `response_index` that finds the format in the list of
 /// responses ([`place_of_response`]). The build fails if the format is not listed.
 #[macro_export]
 macro_rules! response {
-    ($(#[$doc:meta])* $format:literal $(=> $dialects:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
+    ($(#[$doc:meta])* $format:literal $(=> $hosts:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
         $($field:ident: $t:ty),* $(,)?
     }) => {
         $(#[$doc])*
@@ -238,9 +245,9 @@ macro_rules! response {
                     }),*]),
                     concat!("fields disagree with \"", $format, "\"")
                 );
-                // The given dialects, or else all.
-                let dialects = [$($dialects,)? $crate::mcu::Dialects::ALL][0];
-                $crate::mcu::Form { format: $format, dialects }
+                // The given hosts, or else all.
+                let hosts = [$($hosts,)? $crate::mcu::Hosts::ALL][0];
+                $crate::mcu::Form { format: $format, hosts }
             };
             const INDEX: usize = super::response_index($format);
             fn encode(&self, writer: &mut $crate::protocol::vlq::Writer) {

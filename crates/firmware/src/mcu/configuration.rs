@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The host's configuration, and how the MCU forgets it.
 
-use crate::shutdown::Shutdown;
+use crate::shutdown::{Shutdown, reason};
 
 use super::base::Config;
 use super::{Mcu, Note, TimerId};
@@ -60,6 +60,26 @@ impl Mcu {
         self.state.phase.request_reset()?;
         self.reset_if_due();
         Ok(())
+    }
+
+    /// Makes the MCU ready for another process of the host. The process that configured it is gone.
+    ///
+    /// A running MCU stays as it is: the process may go on with its configuration, as in Klipper's C. An MCU that has
+    /// stopped, or whose configuration has not been finished, is of no use to the process. It is reset as by
+    /// `config_reset`, after a stop that drives every output to its shutdown value.
+    pub fn renew(&mut self) {
+        if self.is_running() || !self.state.phase.is_allocated() && !self.is_shutdown() {
+            return;
+        }
+        self.state.wire.note(Note::Renewed);
+        if !self.is_shutdown() {
+            self.shut_down(Shutdown::because(
+                reason::COMMAND_REQUEST,
+                "the host ended in the middle of its configuration",
+            ));
+        }
+        // It is stopped, which is all that a reset asks for.
+        let _ = self.reset();
     }
 
     pub(super) fn reset_if_due(&mut self) {

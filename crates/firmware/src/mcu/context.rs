@@ -7,8 +7,8 @@ use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
 use super::stop::Subject;
+use super::{Command, Dialect, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 use super::{DeviceWarning, Note};
-use super::{Dialect, Dialects, Hold, MovePool, Object, Oid, Response, State, Timer, TimerId, WireClock};
 
 /// The operations that a feature may use in a call. The timers and jobs that an object starts here are its own.
 ///
@@ -40,14 +40,14 @@ impl<'a> Context<'a> {
         self.state.wire.send(response);
     }
 
-    /// Whether the host uses responses of type `R`.
+    /// Whether the host needs responses of type `R`.
     pub fn speaks<R: Response>(&self) -> bool {
         self.state.wire.speaks::<R>()
     }
 
-    /// Whether the MCU behaves as hosts of these dialects expect, where no form of a message differs.
-    pub fn serves(&self, hosts: Dialects) -> bool {
-        self.state.wire.serves(hosts)
+    /// Whether the host needs this form of a command. Some behavior depends on the form of another command.
+    pub fn takes(&self, command: &Command) -> bool {
+        self.state.wire.dialect().needs(command.format)
     }
 
     /// The dialect of the present host. The MCU may not be able to serve it yet.

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The ids of all messages, and the dictionary that gives them to the host.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 use std::io;
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::board::{Board, Range};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
@@ -13,13 +13,14 @@ use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::Reader;
 
 use super::command::{Command, ConstantValue, Feature, Handler};
-use super::{DialectName, Dialects, Wire, base, since};
+use super::forms::{Entry, Item, Part, entries};
+use super::{DialectName, Forms, Wire, base};
 
 /// The remedy for a host with another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
 
 /// A command of the dialect, found by its id.
-pub(super) struct Entry {
+pub(super) struct Known {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
     pub(super) in_shutdown: bool,
@@ -29,11 +30,11 @@ pub(super) struct Entry {
     conversions: Box<[Conversion]>,
 }
 
-impl Entry {
-    fn new(command: &Command, is_own: bool) -> io::Result<Entry> {
+impl Known {
+    fn new(command: &Command, is_own: bool) -> io::Result<Known> {
         let conversions = format::parameters(command.format)
             .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
-        Ok(Entry {
+        Ok(Known {
             format: command.format,
             handler: command.handler,
             in_shutdown: command.in_shutdown,
@@ -65,43 +66,6 @@ fn place(id: u32) -> usize {
     (id as i32).wrapping_sub(SHORT_IDS.start) as u32 as usize
 }
 
-/// All features' entries of one kind.
-fn all<'a, T>(
-    features: &'a [Feature],
-    of: fn(&'a Feature) -> &'static [T],
-) -> impl Iterator<Item = &'static T> + Clone {
-    features.iter().flat_map(of)
-}
-
-/// The forms of one kind that a dialect has.
-struct Choice<T: 'static> {
-    /// The name of a form, and the hosts that use it.
-    facts: fn(&'static T) -> (&'static str, Dialects),
-    /// Maps each name to the part of the dialect whose form it uses.
-    chosen: HashMap<&'static str, DialectName>,
-}
-
-impl<T> Choice<T> {
-    fn new(
-        dialect: &DialectName,
-        forms: impl Iterator<Item = &'static T> + Clone,
-        facts: fn(&'static T) -> (&'static str, Dialects),
-    ) -> Choice<T> {
-        let mut chosen = HashMap::new();
-        for part in dialect.parts() {
-            for (name, _) in forms.clone().map(facts).filter(|(_, takers)| takers.contains(*part)) {
-                chosen.entry(name).or_insert(*part);
-            }
-        }
-        Choice { facts, chosen }
-    }
-
-    fn has(&self, form: &'static T) -> bool {
-        let (name, takers) = (self.facts)(form);
-        self.chosen.get(name).is_some_and(|part| takers.contains(*part))
-    }
-}
-
 /// The features of an MCU, and the facts about the program in its dictionary.
 pub struct Firmware {
     /// The features. The MCU's own feature comes first.
@@ -118,12 +82,32 @@ pub struct Firmware {
     pub wire: Wire,
 }
 
+/// The names that a board adds to a dictionary.
+pub struct Names {
+    /// The values of the enumerations, in the order of [`entries`]. Empty for other entries.
+    values: Vec<Map<String, Value>>,
+    constants: Vec<(String, Value)>,
+}
+
+impl Names {
+    /// The present names of a board.
+    pub fn of(firmware: &Firmware, board: &dyn Board) -> Names {
+        let values = |entry: Entry| match entry.item {
+            Item::Enumeration(enumeration) => numbers((enumeration.values)(board)),
+            _ => Map::new(),
+        };
+        Names { values: entries(firmware.features).into_iter().map(values).collect(), constants: board.constants() }
+    }
+}
+
 /// The messages that a host and the MCU may exchange, by their ids.
 pub struct Dialect {
-    name: DialectName,
+    forms: Forms,
+    /// The formats of the messages that the host needs.
+    needed: HashSet<&'static str>,
     wire: Wire,
     /// Indexed by the [`place`] of the id.
-    commands: Vec<Option<Entry>>,
+    commands: Vec<Option<Known>>,
     /// Indexed by [`super::Response::INDEX`].
     response_ids: Vec<Option<u32>>,
     /// The id of `emergency_stop`. Each block is searched for it.
@@ -136,16 +120,22 @@ pub struct Dialect {
 }
 
 impl Firmware {
-    /// The entries of one kind of the features that it has on its wire.
-    fn all<T>(&self, of: fn(&'static Feature) -> &'static [T]) -> impl Iterator<Item = &'static T> + Clone {
-        self.features.iter().filter(|feature| (feature.is_on)(&self.wire)).flat_map(of)
+    /// All entries, each with its part in the dictionary for these forms.
+    fn choose(&self, forms: &Forms) -> Vec<(Entry, Part)> {
+        let entries = entries(self.features);
+        let parts = forms.parts(&entries);
+        let is_on = |entry: &Entry| (self.features[entry.feature].is_on)(&self.wire);
+        entries
+            .into_iter()
+            .zip(parts)
+            .map(|(entry, part)| if is_on(&entry) { (entry, part) } else { (entry, Part::Left) })
+            .collect()
     }
 }
 
 /// A dictionary that describes the program and has no messages yet.
-fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
-    let hosts = since(DialectName::V0_13);
-    let is_named = name.parts().iter().any(|part| hosts.contains(*part));
+fn head(firmware: &Firmware, forms: &Forms) -> Dictionary {
+    let is_named = !matches!(forms, Forms::Dialect(DialectName::V0_11 | DialectName::V0_12));
     let named = |text: &str| if is_named { text.to_owned() } else { String::new() };
     Dictionary {
         app: named(firmware.app),
@@ -157,95 +147,116 @@ fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
 }
 
 /// The commands by the [`place`] of their ids, and the ids of the responses in the features' order.
-type Numbered = (Vec<Option<Entry>>, Vec<Option<u32>>);
+type Numbered = (Vec<Option<Known>>, Vec<Option<u32>>);
 
-/// Gives ids to the messages of a dialect, and adds them to the dictionary.
-fn number(firmware: &Firmware, name: &DialectName, dictionary: &mut Dictionary) -> io::Result<Numbered> {
-    let features = firmware.features;
+/// Gives ids to the messages of a dictionary, and adds them to it.
+fn number(chosen: &[(Entry, Part)], dictionary: &mut Dictionary) -> io::Result<Numbered> {
     let mut ids = ids();
     let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
     let (mut commands, mut response_ids) = (Vec::new(), Vec::new());
-    let responses =
-        Choice::new(name, firmware.all(|feature| feature.responses), |form| (format::name(form.format), form.dialects));
-    let taken = Choice::new(name, firmware.all(|feature| feature.commands), |command| {
-        (format::name(command.format), command.dialects)
-    });
-    // The MCU's own messages have the same ids in every dialect. The MCU may get another dialect after its host has
-    // read the dictionary. That host's `emergency_stop` must still work.
-    let (base, others) = features.split_at(features.len().min(1));
-    for (features, is_own) in [(base, true), (others, false)] {
+    response_ids.resize(chosen.iter().filter(|(entry, _)| matches!(entry.item, Item::Response(_))).count(), None);
+    // The MCU's own messages have the same ids in every dictionary. The MCU may get another dictionary after its host
+    // has read one. That host's `emergency_stop` must still work. Hosts up to June 2024 know only ids of one byte, so
+    // spare messages get no others.
+    for (is_own, wanted) in [(true, Part::Needed), (false, Part::Needed), (false, Part::Spare)] {
+        let here = |entry: &Entry, part: Part| (entry.feature == 0) == is_own && part == wanted;
+        let mut spare_id =
+            || next_id().map(|id| Some(id).filter(|id| wanted == Part::Needed || SHORT_IDS.contains(id)));
         // Responses first: their data fills a block to the last byte, so their ids must be short.
-        for form in all(features, |feature| feature.responses) {
-            if !responses.has(form) {
-                response_ids.push(None);
-                continue;
-            }
+        let responses = chosen.iter().filter_map(|(entry, part)| match entry.item {
+            Item::Response(form) => Some((entry, form, *part)),
+            _ => None,
+        });
+        for (index, (_, form, _)) in responses.enumerate().filter(|(_, (entry, _, part))| here(entry, *part)) {
             let id = match format::name(form.format) {
-                "identify_response" => IDENTIFY_RESPONSE_ID,
-                _ => next_id()?,
+                "identify_response" => Some(IDENTIFY_RESPONSE_ID),
+                _ => spare_id()?,
             };
-            response_ids.push(Some(id as u32));
+            let Some(id) = id else { break };
+            response_ids[index] = Some(id as u32);
             dictionary.responses.insert(form.format.into(), json!(id));
         }
-        for command in all(features, |feature| feature.commands).filter(|command| taken.has(command)) {
-            let id = match format::name(command.format) {
-                "identify" => IDENTIFY_ID,
-                _ => next_id()?,
+        for (entry, part) in chosen {
+            let Item::Command(command) = entry.item else { continue };
+            if !here(entry, *part) {
+                continue;
+            }
+            let id = match entry.name {
+                "identify" => Some(IDENTIFY_ID),
+                _ => spare_id()?,
             };
+            let Some(id) = id else { break };
             let place = place(id as u32);
             if commands.len() <= place {
                 commands.resize_with(place + 1, || None);
             }
-            commands[place] = Some(Entry::new(command, is_own)?);
+            commands[place] = Some(Known::new(command, is_own)?);
             dictionary.commands.insert(command.format.into(), json!(id));
         }
     }
     Ok((commands, response_ids))
 }
 
-/// Adds the constants and enumerations of a dialect to the dictionary.
-fn publish_names(firmware: &Firmware, name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
-    let constants = firmware.all(|feature| feature.constants);
-    let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.dialects));
-    for constant in constants.filter(|constant| had.has(constant)) {
-        let value = match constant.value {
-            ConstantValue::Number(number) => json!(number),
-            ConstantValue::Text(text) => json!(text),
-        };
-        dictionary.config.insert(constant.name.into(), value);
+/// Adds the constants and enumerations to the dictionary.
+fn publish_names(chosen: &[(Entry, Part)], firmware: &Firmware, names: &Names, dictionary: &mut Dictionary) {
+    for ((entry, _), values) in chosen.iter().zip(&names.values).filter(|((_, part), _)| *part == Part::Needed) {
+        match entry.item {
+            Item::Constant(constant) => {
+                let value = match constant.value {
+                    ConstantValue::Number(number) => json!(number),
+                    ConstantValue::Text(text) => json!(text),
+                };
+                dictionary.config.insert(constant.name.into(), value);
+            }
+            Item::Enumeration(enumeration) => {
+                dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values.clone()));
+            }
+            Item::Command(_) | Item::Response(_) => {}
+        }
     }
     if let Some((name, value)) = firmware.wire.rate() {
         dictionary.config.insert(name.into(), json!(value));
     }
-    dictionary.config.extend(board.constants());
-    let enumerations = firmware.all(|feature| feature.enumerations);
-    let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.dialects));
-    for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
-        let values = names((enumeration.values)(board));
-        dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
-    }
+    dictionary.config.extend(names.constants.iter().cloned());
 }
 
 impl Dialect {
-    /// Gives ids to the messages that hosts of this dialect use, and makes the dictionary with the board's names.
-    pub fn new(firmware: &Firmware, board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
-        let mut dictionary = head(firmware, &name);
-        let (commands, response_ids) = number(firmware, &name, &mut dictionary)?;
-        publish_names(firmware, &name, board, &mut dictionary);
-        let shutdowns: Vec<ShutdownReason> = firmware.all(|feature| feature.shutdowns).copied().collect();
+    /// Gives ids to the messages of these forms, and makes the dictionary with the board's names.
+    pub fn new(firmware: &Firmware, board: &dyn Board, forms: impl Into<Forms>) -> io::Result<Dialect> {
+        Dialect::with_names(firmware, &Names::of(firmware, board), forms.into())
+    }
+
+    /// The same, with the board's names as they were.
+    pub fn with_names(firmware: &Firmware, names: &Names, forms: Forms) -> io::Result<Dialect> {
+        let chosen = firmware.choose(&forms);
+        let mut dictionary = head(firmware, &forms);
+        let (commands, response_ids) = number(&chosen, &mut dictionary)?;
+        publish_names(&chosen, firmware, names, &mut dictionary);
+        let needed = chosen.iter().filter(|(_, part)| *part == Part::Needed).map(|(entry, _)| entry.text).collect();
+        let features = firmware.features.iter().filter(|feature| (feature.is_on)(&firmware.wire));
+        let shutdowns: Vec<ShutdownReason> = features.flat_map(|feature| feature.shutdowns).copied().collect();
         let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
         dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
         let compressed = dictionary.compress()?;
         let wire = firmware.wire.clone();
-        let mut dialect =
-            Dialect { name, wire, commands, response_ids, emergency_stop: None, shutdowns, dictionary, compressed };
+        let mut dialect = Dialect {
+            forms,
+            needed,
+            wire,
+            commands,
+            response_ids,
+            emergency_stop: None,
+            shutdowns,
+            dictionary,
+            compressed,
+        };
         dialect.emergency_stop = dialect.command_id(base::EMERGENCY_STOP.format);
         Ok(dialect)
     }
 
-    /// Which dialect this is.
-    pub fn name(&self) -> DialectName {
-        self.name
+    /// The forms that it was made of.
+    pub fn forms(&self) -> &Forms {
+        &self.forms
     }
 
     /// The wire that its host is on.
@@ -253,9 +264,9 @@ impl Dialect {
         &self.wire
     }
 
-    /// Whether the MCU behaves as these hosts expect, where the form of a message does not say it.
-    pub(super) fn serves(&self, hosts: Dialects) -> bool {
-        self.name.parts().first().is_some_and(|part| hosts.contains(*part))
+    /// Whether the host needs the message of this format. A spare message does not count: it decides no behavior.
+    pub(super) fn needs(&self, format: &str) -> bool {
+        self.needed.contains(format)
     }
 
     /// The dictionary.
@@ -319,7 +330,7 @@ impl Dialect {
     }
 
     #[inline]
-    pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
+    pub(super) fn command(&self, id: u32) -> Result<&Known, Shutdown> {
         match self.commands.get(place(id)) {
             Some(Some(entry)) => Ok(entry),
             _ => {
@@ -330,7 +341,7 @@ impl Dialect {
     }
 }
 
-fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
+fn numbers(ranges: Vec<Range>) -> Map<String, Value> {
     ranges
         .into_iter()
         .map(|range| match range.count {

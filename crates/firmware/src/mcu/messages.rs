@@ -7,7 +7,7 @@ use crate::shutdown::{Shutdown, reason};
 use pinion_protocol::vlq::{Reader, Writer};
 
 use super::dialect::READ_ANEW;
-use super::{Dialect, Dialects, Mcu, Note, Outbox, Response, State, base};
+use super::{Dialect, Mcu, Note, Outbox, Response, State, base};
 
 /// The way to the host and to the log.
 pub(super) struct HostWire {
@@ -47,14 +47,9 @@ impl HostWire {
         }
     }
 
-    /// Whether the host uses responses of type `R`.
+    /// Whether the host needs responses of type `R`.
     pub(super) fn speaks<R: Response>(&self) -> bool {
-        self.dialect.response_id::<R>().is_some()
-    }
-
-    /// Whether the MCU behaves as hosts of these dialects expect.
-    pub(super) fn serves(&self, hosts: Dialects) -> bool {
-        self.dialect.serves(hosts)
+        self.dialect.needs(R::FORM.format)
     }
 
     /// Sends a response, if the host uses it.
@@ -62,7 +57,8 @@ impl HostWire {
         if self.is_foreign() && !base::is_own_response(R::INDEX) {
             return;
         }
-        let Some(id) = self.dialect.response_id::<R>() else { return };
+        // The MCU's own messages are in the form of the present host.
+        let Some(id) = self.heard().response_id::<R>() else { return };
         let mut writer = Writer::default();
         writer.int(id);
         response.encode(&mut writer);
@@ -129,10 +125,7 @@ impl Mcu {
                 Ok(())
             }
             None if is_foreign => {
-                let (spoken, heard) = (self.dialect().name(), self.heard().name());
-                let cause = format!(
-                    "the MCU is configured by a host of the dialect {spoken}, and the present one speaks {heard}"
-                );
+                let cause = "the MCU is configured by a host that uses other forms of messages than the present one";
                 Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy("FIRMWARE_RESTART"))
             }
             _ => (command.handler)(self, payload),
@@ -146,11 +139,11 @@ impl Mcu {
     /// The objects' messages would mean something else to the other host, or nothing. klippy's reader ends at the first
     /// message that it cannot decode. `get_config` gives a checksum that the other host cannot take for its own.
     ///
-    /// If only the board has changed, the dialect is the same and only the names of pins differ. Then the change is
+    /// If only the board has changed, the forms are the same and only the names of pins differ. Then the change is
     /// made at once.
     pub fn speak(&mut self, dialect: Arc<Dialect>) {
         let State { wire, phase, .. } = &mut self.state;
-        let is_free = dialect.name() == wire.dialect.name() || !phase.is_allocated();
+        let is_free = dialect.forms() == wire.dialect.forms() || !phase.is_allocated();
         wire.next = Some(dialect);
         if is_free {
             wire.take_next();

@@ -20,6 +20,7 @@ mod configuration;
 mod context;
 mod dialect;
 mod dialects;
+mod forms;
 mod inputs;
 mod job;
 mod job_slot;
@@ -38,6 +39,7 @@ mod snapshot;
 mod stats;
 mod stop;
 mod timers;
+mod tolerance;
 mod wire;
 
 pub use crate::{command, response};
@@ -47,8 +49,9 @@ pub use bus::{Bus, Chip};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use context::Context;
-pub use dialect::{Dialect, Firmware};
-pub use dialects::{DialectName, Dialects, only, since, until};
+pub use dialect::{Dialect, Firmware, Names};
+pub use dialects::DialectName;
+pub use forms::{Entry, Forms, HostForms, Hosts, Item, Part, entries};
 pub use inputs::{InputLine, Sample};
 pub use job::{AnyJob, DeviceId, Devices, Finished, Job, SentJob, WorkerId, Workers};
 pub use job_slot::{Back, JobSlot};
@@ -63,6 +66,7 @@ pub use scheduler::{Latest, SPIN_MAX};
 pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;
 pub use timers::Timer;
+pub use tolerance::{Device, Limit, Tolerance, Tolerances};
 pub use wire::{CANBUS_UUID_BYTES, CanHealth, CanNode, CanState, Wire};
 
 use barrier::Barrier;
@@ -96,6 +100,8 @@ struct State {
     wire: HostWire,
     board: Box<dyn Board>,
     workers: Box<dyn Workers>,
+    /// The devices whose failures the user tolerates.
+    tolerances: Tolerances,
     /// Set if somebody records the edges of outputs.
     recorder: Option<Arc<dyn EdgeRecorder>>,
 }
@@ -120,10 +126,16 @@ impl Mcu {
             wire: HostWire::new(dialect, outbox),
             board,
             workers,
+            tolerances: Tolerances::new(),
             recorder: None,
         };
         state.wire.send(base::Starting {});
         Mcu { state }
+    }
+
+    /// Tolerates the failures of these devices, if a host configures them from now on.
+    pub fn tolerate(&mut self, tolerances: Tolerances) {
+        self.state.tolerances = tolerances;
     }
 
     /// Records the edges of the outputs that a host claims from now on.

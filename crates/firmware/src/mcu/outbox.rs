@@ -52,4 +52,6 @@ pub enum Note<'a> {
     Lateness(&'a Lateness, Ticks),
     /// The MCU has forgotten its configuration and waits for another.
     Reset,
+    /// Another process has come than the one that configured the MCU, so a stopped MCU is reset.
+    Renewed,
 }

@@ -11,7 +11,7 @@ use crate::lateness::Lateness;
 use crate::shutdown::ShutdownReason;
 use crate::time::Clock;
 
-use super::{DialectName, Mcu, OBJECTS_MAX, Oid, State};
+use super::{Mcu, OBJECTS_MAX, Oid, State};
 
 /// Highest number of lines in a snapshot.
 const LINES_MAX: usize = 512;
@@ -33,8 +33,8 @@ pub struct Snapshot {
     pub is_configured: bool,
     /// Whether a host has begun to configure it.
     pub oids_allocated: bool,
-    /// The dialect that it speaks.
-    pub dialect: Option<DialectName>,
+    /// The [label](super::Forms::label) of the forms of its messages.
+    pub dialect: Option<&'static str>,
     /// Why and when it stopped; `None` while it is not stopped.
     pub stopped: Option<(ShutdownReason, Clock)>,
     /// The cause and remedy of the stop, as in the log.
@@ -117,6 +117,8 @@ pub struct Report {
     pub queued: usize,
     /// Its present value.
     pub value: Option<Present>,
+    /// Whether its device fails and its last answers are repeated.
+    pub repeats: bool,
 }
 
 /// An object's present value.
@@ -256,7 +258,7 @@ impl Mcu {
         to.at = scheduler.last_read();
         to.is_configured = phase.is_finalized();
         to.oids_allocated = phase.is_allocated();
-        to.dialect = Some(wire.dialect().name());
+        to.dialect = Some(wire.dialect().forms().label());
         to.stopped = phase.last_stop().map(|(why, at)| (why.reason, at));
         match phase.last_stop() {
             Some((why, _)) => put(&mut to.detail, &why.trouble),

@@ -39,7 +39,7 @@ impl Core {
                         heard = dialect;
                         None
                     }
-                    Request::Report | Request::Hang => None,
+                    Request::Renew | Request::Report | Request::Hang => None,
                 })
             }
         };
@@ -116,6 +116,7 @@ impl Core {
                 self.mcu.shut_down(shutdown);
             }
             Request::Speak(dialect) => self.mcu.speak(dialect),
+            Request::Renew => self.mcu.renew(),
             Request::Report => self.mcu.report_lateness(self.waiter.margin()),
             Request::Quit(why) => {
                 let is_last = |why: &Shutdown| self.mcu.last_stop().is_some_and(|(stop, _)| stop.reason == why.reason);

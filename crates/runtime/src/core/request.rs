@@ -36,6 +36,8 @@ pub(crate) enum Request {
     Shutdown(Shutdown),
     /// Speak this dialect: another host came. The link keeps a copy, so that the core never frees one.
     Speak(Arc<Dialect>),
+    /// Reset an MCU that is of no use to a new process of the host.
+    Renew,
     /// Report how late timers were.
     Report,
     /// Stop the MCU and end. A running MCU stops for this reason, if there is one. Otherwise somebody asked for it.

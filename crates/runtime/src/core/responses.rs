@@ -160,6 +160,10 @@ impl Outbox for ResponseWriter {
                 line("timers: ", format_args!("timers: {lateness}; the core wakes {margin:.1} us early"));
             }
             Note::Reset => line("configuration", format_args!("configuration dropped, waiting for a new one")),
+            Note::Renewed => line(
+                "the host's process",
+                format_args!("the host's process is gone and another has come: the MCU is reset for it"),
+            ),
             Note::Configured(kinds) => line("configured: ", format_args!("configured: {}", Kinds(kinds))),
         }
     }

@@ -8,7 +8,7 @@ use log::warn;
 use rtrb::RingBuffer;
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{Dialect, EdgeRecorder, Mcu};
+use pinion_firmware::mcu::{Dialect, EdgeRecorder, Mcu, Tolerances};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::parker::Parker;
@@ -37,6 +37,8 @@ pub(crate) struct CoreThread {
     pub(crate) timing: Timing,
     /// The dialect that the MCU speaks before a host comes.
     pub(crate) dialect: Arc<Dialect>,
+    /// The devices whose failures the user tolerates.
+    pub(crate) tolerances: Tolerances,
     pub(crate) wake: Arc<LinkWake>,
     pub(crate) heartbeat: Heartbeat,
     pub(crate) snapshots: SnapshotWriter,
@@ -76,6 +78,7 @@ impl CoreThread {
             let workers =
                 Threads::new(core_parker.clone(), prepare, clock.clone(), heartbeat, self.recording, may_poll);
             let mut mcu = Mcu::new(self.dialect, self.board, timing, Box::new(workers), Box::new(response_ring));
+            mcu.tolerate(self.tolerances);
             self.edges.into_iter().for_each(|edges| mcu.record_edges(edges));
             let waiter = Waiter::new(clock, core_parker, self.margin, scheduling, processors);
             let (requests, progress, wake) = (inbox, core_progress, self.wake);

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dictionary for a new host: its dialect, and the board's present devices. The host's first bytes wait for
+//! Finds the dictionary for a new host: its forms of messages, and the board's present devices. The host's first bytes wait for
 //! that.
 
-use std::iter;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,7 +16,7 @@ use pinion_linux::clock::monotonic;
 use crate::FIRMWARE;
 
 use crate::core::responses::LinkWake;
-use crate::host::search::{HostFinder, HostSearch};
+use crate::host::search::{Found, HostFinder, HostSearch};
 use crate::link::survey::{self, Surveyor};
 use crate::status::HostStatus;
 use crate::trouble::started;
@@ -29,17 +28,18 @@ const FIND_LIMIT: Duration = Duration::from_secs(3);
 
 /// Finds the facts about a host.
 pub(crate) struct Handshake {
-    /// The dialects that a host may speak. The first one is spoken before a host comes.
-    dialects: Vec<Arc<Dialect>>,
-    /// The dialects before the last change of the board. They stay until the next change, so that the core never frees
-    /// one.
-    outdated: Vec<Arc<Dialect>>,
+    /// The dialect that is spoken before a host comes, and to a host about which nothing was found in time.
+    first: Arc<Dialect>,
+    /// The dialects that the core may have. They stay here, so that the core never frees one.
+    kept: Vec<Arc<Dialect>>,
     /// `None` if the dialect does not depend on the host.
     finder: Option<HostFinder>,
-    /// `None` if the board never changes.
+    /// `None` in a test without a board.
     surveyor: Option<Surveyor>,
     /// The end of the wait of the host's first bytes (CLOCK_MONOTONIC). `None` while none wait.
     until: Option<Duration>,
+    /// The search for the host has to answer.
+    is_finding: bool,
     /// The bytes have waited too long, and the answer is still missing.
     is_overdue: bool,
 }
@@ -48,6 +48,8 @@ pub(crate) struct Handshake {
 pub(crate) enum Step {
     /// The host's bytes have to wait.
     Wait,
+    /// The process that configured the MCU is gone, and another one has come.
+    Renew,
     /// This dialect is spoken from now on.
     Speak(Arc<Dialect>),
     /// Everything is found.
@@ -65,43 +67,35 @@ impl Handshake {
         wake: &Arc<LinkWake>,
         shown: &Arc<HostStatus>,
     ) -> Result<Handshake, Trouble> {
-        let names = match only {
-            Some(name) => vec![name],
-            None => iter::once(DialectName::Union).chain(DialectName::OF_HOSTS).collect(),
-        };
         let firmware = Firmware { wire, ..FIRMWARE };
-        let dialects = survey::dialects(&firmware, board, &names)?;
+        let first = survey::dialect(&firmware, board, only.unwrap_or(DialectName::Union).into())?;
         let search = search.filter(|_| only.is_none()).zip(terminal);
         let finder = search.map(|(search, terminal)| HostFinder::start(search, terminal, wake.clone(), shown.clone()));
         let finder = finder.map(started).transpose()?;
-        let surveyor =
-            board.view().map(|view| started(Surveyor::start(firmware, view, names, wake.clone()))).transpose()?;
-        Ok(Handshake { dialects, outdated: Vec::new(), finder, surveyor, until: None, is_overdue: false })
+        let surveyor = Some(started(Surveyor::start(firmware, board, first.clone(), wake.clone()))?);
+        Ok(Handshake { surveyor, finder, ..Handshake::of(first) })
     }
 
     /// Every host speaks this dialect, and the board never changes.
-    #[cfg(fuzzing)]
-    pub(crate) fn of(dialect: Arc<Dialect>) -> Handshake {
-        let dialects = vec![dialect];
-        Handshake { dialects, outdated: Vec::new(), finder: None, surveyor: None, until: None, is_overdue: false }
+    pub(crate) fn of(first: Arc<Dialect>) -> Handshake {
+        let kept = vec![first.clone()];
+        Handshake { first, kept, finder: None, surveyor: None, until: None, is_finding: false, is_overdue: false }
     }
 
     /// The dialect that is spoken before a host comes.
     pub(crate) fn first_dialect(&self) -> Arc<Dialect> {
-        self.dialects[0].clone()
+        self.first.clone()
     }
 
     /// A host has come, and has `terminal` open.
     pub(crate) fn begin(&mut self, terminal: Option<&Path>) {
-        if let Some(surveyor) = &mut self.surveyor {
-            surveyor.ask();
-        }
+        let Some(surveyor) = &mut self.surveyor else { return };
+        surveyor.look();
+        self.until = Some(monotonic() + FIND_LIMIT);
         if let Some(finder) = &mut self.finder {
             finder.ask(terminal);
+            self.is_finding = true;
             self.is_overdue = false;
-        }
-        if self.surveyor.is_some() || self.finder.is_some() {
-            self.until = Some(monotonic() + FIND_LIMIT);
         }
     }
 
@@ -110,53 +104,50 @@ impl Handshake {
         self.until = None;
     }
 
-    /// Goes on as far as it can. `spoken` is the present dialect. Call it again after [`Step::Speak`].
-    pub(crate) fn step(&mut self, spoken: DialectName) -> Step {
-        let Some(until) = self.until else {
+    /// Goes on as far as it can. Call it again until it is [`Step::Wait`] or [`Step::Done`].
+    pub(crate) fn step(&mut self) -> Step {
+        let (Some(until), Some(surveyor)) = (self.until, &mut self.surveyor) else {
             self.hear_late_answer();
             return Step::Done;
         };
-        let is_late = monotonic() >= until;
-        if let Some(surveyor) = &mut self.surveyor {
-            if !surveyor.is_done() && !is_late {
-                return Step::Wait;
-            }
-            if let Some(dialects) = surveyor.take() {
-                self.outdated = std::mem::replace(&mut self.dialects, dialects);
-                return self.speak(spoken);
+        if self.is_finding
+            && let Some(Found { forms, is_other }) = self.finder.as_mut().and_then(HostFinder::answer)
+        {
+            self.is_finding = false;
+            surveyor.make(forms);
+            if is_other {
+                return Step::Renew;
             }
         }
-        let Some(finder) = &mut self.finder else {
-            self.until = None;
-            return Step::Done;
-        };
-        let name = match finder.answer() {
-            Some(name) => name,
-            None if is_late => {
-                warn!(
-                    "the host's dialect was not found within {FIND_LIMIT:?}, so it gets the union of v0.13, master and Kalico: send RESTART, or set its dialect"
-                );
-                self.is_overdue = true;
-                DialectName::Union
-            }
-            None => return Step::Wait,
-        };
+        let is_late = monotonic() >= until;
+        if !is_late && (self.is_finding || !surveyor.is_done()) {
+            return Step::Wait;
+        }
         self.until = None;
-        self.speak(name)
+        let found = surveyor.take();
+        if self.is_finding || self.finder.is_some() && !surveyor.is_done() {
+            warn!(
+                "the host's messages were not found within {FIND_LIMIT:?}, so it gets the union of v0.13, master and Kalico: send RESTART, or set its dialect"
+            );
+            self.is_overdue = self.is_finding;
+            return self.speak(self.first.clone());
+        }
+        found.map_or(Step::Done, |dialect| self.speak(dialect))
     }
 
-    fn speak(&self, name: DialectName) -> Step {
-        let of_name = self.dialects.iter().find(|dialect| dialect.name() == name);
-        of_name.map_or(Step::Done, |dialect| Step::Speak(dialect.clone()))
+    fn speak(&mut self, dialect: Arc<Dialect>) -> Step {
+        self.kept.retain(|kept| Arc::strong_count(kept) > 1);
+        self.kept.push(dialect.clone());
+        Step::Speak(dialect)
     }
 
     /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
         let answer = self.finder.as_mut().filter(|_| self.is_overdue).and_then(HostFinder::answer);
-        let Some(name) = answer else { return };
+        let Some(Found { forms, .. }) = answer else { return };
         self.is_overdue = false;
-        if name != DialectName::Union {
-            warn!("the host's dialect {name} was found too late: send RESTART to use it");
+        if forms != *self.first.forms() {
+            warn!("the host's messages were found too late: send RESTART to use them");
         }
     }
 }

@@ -12,7 +12,7 @@ use std::time::Duration;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
-use pinion_firmware::mcu::base::{ClockResponse, Config, IdentifyResponse, Uptime, identify_response};
+use pinion_firmware::mcu::base::{ClockResponse, Config, ConfigOfV010, IdentifyResponse, Uptime, identify_response};
 use pinion_firmware::mcu::{Dialect, Response};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, TimeSource};
@@ -91,7 +91,10 @@ impl Known {
                 let piece: IdentifyResponse<'_> = identify_response(self.dialect.compressed(), offset, count);
                 self.encode(&piece)
             }
-            Question::Config => self.encode(&config()?),
+            Question::Config => {
+                let config = config()?;
+                self.encode(&config).or_else(|| self.encode(&ConfigOfV010::from(config)))
+            }
         }
     }
 
@@ -323,8 +326,9 @@ impl LinkThread {
     /// Whether the link still has to find the host's dialect or the board's devices.
     fn is_finding(&mut self) -> bool {
         loop {
-            match self.handshake.step(self.known.dialect.name()) {
+            match self.handshake.step() {
                 Step::Wait => return true,
+                Step::Renew => self.request(Request::Renew),
                 Step::Speak(dialect) => self.speak(dialect),
                 Step::Done => return false,
             }
@@ -338,7 +342,7 @@ impl LinkThread {
         if Arc::ptr_eq(&dialect, &self.known.dialect) {
             return;
         }
-        if dialect.name() != self.known.dialect.name() {
+        if dialect.forms() != self.known.dialect.forms() {
             self.changed_at = Some(self.core.ledger.handed());
         }
         self.known = Known::new(dialect.clone());

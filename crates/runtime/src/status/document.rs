@@ -193,6 +193,7 @@ fn object(state: &ObjectState, pins: &[Range]) -> form::Object {
             Present::Pwm(value) => form::Present::Duty(rounded(f64::from(value) / f64::from(PWM_MAX))),
             Present::Steps(steps) => form::Present::Steps(steps),
         }),
+        repeats: state.report.repeats,
         bus: state.bus.map(bus),
     }
 }

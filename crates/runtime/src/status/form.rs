@@ -193,6 +193,9 @@ pub struct Object {
     pub queued: usize,
     /// Its value now, if it has one.
     pub value: Option<Present>,
+    /// Its device fails, and its last answers are repeated.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub repeats: bool,
     /// Transfers to its chip, if it has one on a bus.
     pub bus: Option<BusCounts>,
 }

@@ -120,7 +120,6 @@ impl Part for AngleConfig {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section(format_args!("angle {}", self.axis));
         cfg.key("sensor_type", self.chip.name());
-        cfg.comment("Take it out for Kalico, whose Linux firmware has no angle sensors.");
         cfg.spi(&self.bus, Some(&self.select_pin));
         cfg.comment("To measure with it, and for ANGLE_CALIBRATE; needs a driver on this stepper, and numpy:");
         cfg.offer(|cfg| cfg.key("stepper", layout.stepper(&self.axis)));

@@ -24,6 +24,8 @@ const FILES_MAX: usize = 2000;
 const FILE_BYTES_MAX: u64 = 1 << 20;
 const BYTES_MAX: u64 = 32 << 20;
 const SHAPES_MAX: usize = 10_000;
+/// Longest message. klippy's have at most 150 bytes.
+const SHAPE_BYTES_MAX: usize = 1000;
 /// Highest depth of folders: klippy's own folder, `extras`, and packages in there.
 const DEPTH_MAX: usize = 3;
 
@@ -34,31 +36,42 @@ const DEPTH_MAX: usize = 3;
 pub struct Shape(String);
 
 impl Shape {
-    /// The shape of a format. `None` for a text that is not a format with parameters.
+    /// The shape of a format. `None` for a text that is not a format with parameters. A parameter's value is a
+    /// conversion, a part of a Python f-string, or a number.
     pub fn of(format: &str) -> Option<Shape> {
-        let (name, parameters) = format.split_once(' ')?;
         let is_word = |word: &str| {
             word.starts_with(|c: char| c.is_ascii_lowercase())
                 && word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
         };
+        let (name, mut rest) = format.split_once(' ')?;
         if !is_word(name) {
             return None;
         }
         let mut shape = name.to_owned();
-        for parameter in parameters.split(' ') {
-            let (key, conversion) = parameter.split_once('=')?;
-            if !is_word(key) || !conversion.starts_with('%') {
+        loop {
+            let (key, value) = rest.split_once('=')?;
+            if !is_word(key) {
                 return None;
             }
             shape.push(' ');
             shape.push_str(key);
+            let end = value_end(value)?;
+            match value[end..].strip_prefix(' ') {
+                Some(more) => rest = more,
+                None if end == value.len() => return Some(Shape(shape)),
+                None => return None,
+            }
         }
-        Some(Shape(shape))
     }
 
     /// The message's name.
     pub fn name(&self) -> &str {
         self.0.split(' ').next().unwrap_or_default()
+    }
+
+    /// The names of its parameters.
+    pub fn parameters(&self) -> impl Iterator<Item = &str> {
+        self.0.split(' ').skip(1)
     }
 
     /// Name and parameters, for people.
@@ -67,16 +80,42 @@ impl Shape {
     }
 }
 
-/// The contents of klippy's folder.
+/// Where a parameter's value ends.
+fn value_end(value: &str) -> Option<usize> {
+    let word = value.find(' ').unwrap_or(value.len());
+    match value.as_bytes().first()? {
+        b'%' => Some(word),
+        b'{' => {
+            let mut depth = 0;
+            let mut ends = value.bytes().enumerate().filter_map(|(at, byte)| {
+                depth += i32::from(byte == b'{') - i32::from(byte == b'}');
+                (depth == 0).then_some(at + 1)
+            });
+            ends.next()
+        }
+        _ => value[..word].parse::<i64>().is_ok().then_some(word),
+    }
+}
+
+/// The contents of a folder of sources.
 #[derive(Debug)]
 pub struct Sources {
     /// The shapes of all messages.
     pub shapes: BTreeSet<Shape>,
+    /// The wanted words that stand alone in a string.
+    pub words: BTreeSet<String>,
     /// When the newest file was written.
     pub newest: SystemTime,
     /// The first part that could not be read, if any.
     pub unread: Option<String>,
     bytes: u64,
+}
+
+impl Default for Sources {
+    fn default() -> Sources {
+        let (shapes, words) = (BTreeSet::new(), BTreeSet::new());
+        Sources { shapes, words, newest: SystemTime::UNIX_EPOCH, unread: None, bytes: 0 }
+    }
 }
 
 impl Sources {
@@ -85,14 +124,36 @@ impl Sources {
     /// # Errors
     ///
     /// The folder itself cannot be read. Files in it that cannot be read are left out: they may be a plugin's.
-    pub fn read(klippy: &Path) -> io::Result<Sources> {
-        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH, unread: None, bytes: 0 };
+    pub fn read(klippy: &Path, is_wanted: &dyn Fn(&str) -> bool) -> io::Result<Sources> {
+        let mut sources = Sources::default();
+        sources.read_folder(klippy, "py", DEPTH_MAX, is_wanted)?;
+        Ok(sources)
+    }
+
+    /// The messages in the C sources of a firmware for Linux. Nothing is found if they cannot be read: they are needed
+    /// only to build that firmware.
+    pub fn of_firmware(src: &Path) -> BTreeSet<Shape> {
+        let mut sources = Sources::default();
+        for folder in [src.to_owned(), src.join("linux")] {
+            // `Err` is a checkout without these sources.
+            let _ = sources.read_folder(&folder, "c", 1, &|_| false);
+        }
+        sources.shapes
+    }
+
+    fn read_folder(
+        &mut self,
+        folder: &Path,
+        extension: &str,
+        depth_max: usize,
+        is_wanted: &dyn Fn(&str) -> bool,
+    ) -> io::Result<()> {
         let (mut names, mut files) = (0, 0);
-        let mut folders = VecDeque::from([(klippy.to_owned(), 1)]);
+        let mut folders = VecDeque::from([(folder.to_owned(), 1)]);
         while let Some((folder, depth)) = folders.pop_front() {
             let entries = match fs::read_dir(&folder) {
                 Err(error) if depth > 1 => {
-                    sources.leave_out(&folder, &error);
+                    self.leave_out(&folder, &error);
                     continue;
                 }
                 entries => entries?,
@@ -101,30 +162,31 @@ impl Sources {
                 // The checkout may change while it is read: an update, or a plugin that is installed.
                 let entry = match entry {
                     Err(error) => {
-                        sources.leave_out(&folder, &error);
+                        self.leave_out(&folder, &error);
                         break;
                     }
                     Ok(entry) => entry,
                 };
                 let path = entry.path();
-                if names == NAMES_MAX || files == FILES_MAX || sources.bytes >= BYTES_MAX {
-                    return Ok(sources);
+                if names == NAMES_MAX || files == FILES_MAX || self.bytes >= BYTES_MAX {
+                    self.unread.get_or_insert_with(|| format!("{} has too many files", folder.display()));
+                    return Ok(());
                 }
                 names += 1;
-                if path.extension().is_some_and(|extension| extension == "py") {
+                if path.extension().is_some_and(|found| found == extension) {
                     files += 1;
-                    if let Err(error) = sources.add(&path) {
-                        sources.leave_out(&path, &error);
+                    if let Err(error) = self.add(&path, is_wanted) {
+                        self.leave_out(&path, &error);
                     }
-                } else if depth < DEPTH_MAX && entry.file_type().is_ok_and(|kind| !kind.is_file()) && path.is_dir() {
+                } else if depth < depth_max && entry.file_type().is_ok_and(|kind| !kind.is_file()) && path.is_dir() {
                     folders.push_back((path, depth + 1));
                 }
             }
         }
-        Ok(sources)
+        Ok(())
     }
 
-    fn add(&mut self, path: &Path) -> io::Result<()> {
+    fn add(&mut self, path: &Path, is_wanted: &dyn Fn(&str) -> bool) -> io::Result<()> {
         let (file, metadata) = match foreign::open(path) {
             // A link that leads nowhere is a removed plugin, and klippy does not load it. klippy also does not load
             // things that are not files, such as a FIFO.
@@ -141,11 +203,15 @@ impl Sources {
         self.bytes += text.len() as u64;
         self.newest = self.newest.max(metadata.modified()?);
         // Most files have no message, and need not be read as Python.
-        if text.windows(2).any(|pair| pair == b"=%") {
-            strings(&text, |string| {
-                if self.shapes.len() < SHAPES_MAX {
-                    self.shapes.extend(Shape::of(string));
+        if text.windows(2).any(|pair| pair == b"=%" || pair == b"={") {
+            strings(&text, |string| match Shape::of(string).filter(|_| string.len() <= SHAPE_BYTES_MAX) {
+                Some(shape) if self.shapes.len() < SHAPES_MAX => {
+                    self.shapes.insert(shape);
                 }
+                None if is_wanted(string) => {
+                    self.words.insert(string.to_owned());
+                }
+                _ => {}
             });
         }
         Ok(())
@@ -248,8 +314,23 @@ mod tests {
         assert_eq!(shape("query_adxl345 oid=%c rest_ticks=%u").as_deref(), Some("query_adxl345 oid rest_ticks"));
         assert_eq!(shape("config_spi oid=%d pin=%s").as_deref(), Some("config_spi oid pin"));
         assert_eq!(shape("i2c_write oid=%c data=%*s").as_deref(), Some("i2c_write oid data"));
-        for text in ["get_clock", "speed=%d", "Speed limit=%d", "a b", "a b= c=%d", "a  b=%d", "a b=%d, c=%d is wrong"]
-        {
+        assert_eq!(
+            shape("q_x oid={self.oid} i2c_oid={ {'a b': 1}[k] } rest=0").as_deref(),
+            Some("q_x oid i2c_oid rest")
+        );
+        for text in [
+            "get_clock",
+            "speed=%d",
+            "a b={c",
+            "a b={c}d",
+            "a b=1.5",
+            "a b=c",
+            "Speed limit=%d",
+            "a b",
+            "a b= c=%d",
+            "a  b=%d",
+            "a b=%d, c=%d is wrong",
+        ] {
             assert_eq!(shape(text), None, "{text}");
         }
     }
@@ -278,7 +359,7 @@ mod tests {
                     let _ = fs::remove_file(&extras);
                 }
             });
-            let sources: Vec<_> = (0..ROUNDS).map(|_| Sources::read(here)).collect();
+            let sources: Vec<_> = (0..ROUNDS).map(|_| Sources::read(here, &|_| false)).collect();
             is_over.store(true, Ordering::Relaxed);
             for sources in sources {
                 let shapes = sources.unwrap().shapes;
@@ -296,7 +377,7 @@ mod tests {
             fs::write(path, text).unwrap();
         };
         put("mcu.py", "a('trsync_start oid=%c' ' report_clock=%u')");
-        put("extras/bus.py", "b = \"i2c_write oid=%c data=%*s\"");
+        put("extras/bus.py", "b = \"i2c_write oid=%c data=%*s\", 'STEPPER_STEP_BOTH_EDGE', 'other'");
         put("extras/display/hd44780.py", "c('hd44780_send_cmds oid=%c cmds=%*s')");
         put("a/b/c/deep.py", "d('too_deep oid=%c')");
         put("notes.txt", "'no_python oid=%c'");
@@ -305,13 +386,14 @@ mod tests {
         link("..", "extras/round");
         link("self.py", "extras/self.py");
         nix::unistd::mkfifo(&folder.path().join("extras/fifo.py"), nix::sys::stat::Mode::S_IRWXU).unwrap();
-        let sources = Sources::read(folder.path()).unwrap();
+        let sources = Sources::read(folder.path(), &|word| word == "STEPPER_STEP_BOTH_EDGE").unwrap();
         let shapes: Vec<&str> = sources.shapes.iter().map(Shape::as_str).collect();
         assert_eq!(shapes, ["hd44780_send_cmds oid cmds", "i2c_write oid data", "trsync_start oid report_clock"]);
+        assert_eq!(sources.words.into_iter().collect::<Vec<_>>(), ["STEPPER_STEP_BOTH_EDGE"]);
         // A file that cannot be read loses nothing else. Here it is a link that leads to itself: root may read any
         // file.
         let unread = sources.unread.unwrap();
         assert!(unread.contains("extras/self.py: "), "{unread}");
-        assert!(Sources::read(&folder.path().join("none")).is_err());
+        assert!(Sources::read(&folder.path().join("none"), &|_| false).is_err());
     }
 }

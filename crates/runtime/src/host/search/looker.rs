@@ -16,11 +16,11 @@ use nix::sys::socket::{MsgFlags, recv, send};
 use nix::unistd::{SysconfVar, sysconf};
 use serde::Serialize;
 
-use crate::host::klippy::Checkout;
-use crate::host::klippy::process::Process;
+use crate::host::klippy::process::{self, Process};
 use crate::host::klippy::terminal::{Search, Terminal, find};
+use crate::host::klippy::{Checkout, names, parts_without};
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::DialectName;
+use pinion_firmware::mcu::{Forms, HostForms};
 use pinion_linux::foreign;
 use pinion_linux::sys;
 
@@ -37,9 +37,6 @@ const MEMORY_BYTES_MAX: rlim_t = 64 << 20;
 const OOM_SCORE: &str = "500";
 /// Longest part of /proc/stat that is read. It has a number for each interrupt.
 const STAT_BYTES_MAX: u64 = 1 << 20;
-
-/// Highest number of unknown forms of messages that the log names.
-const UNKNOWN_SHOWN: usize = 10;
 
 /// The remedy for a host that cannot be inspected.
 const REMEDY: &str = "for an older one name its --dialect, or give Pinion the capabilities CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them";
@@ -59,9 +56,9 @@ pub(super) fn live(socket: &OwnedFd) {
             Ok(len) => serde_json::from_slice(&message[..len]),
         };
         let Ok(Question { number, terminal }) = question else { return };
-        let (dialect, host) = looker.look(terminal);
+        let (forms, host) = looker.look(terminal);
         let lines = std::mem::take(&mut looker.say.0);
-        if !say(socket, &Answer::new(number, dialect, host, lines)) {
+        if !say(socket, &Answer::new(number, forms.as_ref(), looker.is_other, host, lines)) {
             return;
         }
     }
@@ -111,18 +108,38 @@ impl Say {
 struct Looker {
     /// The host that was seen last. A process continues with the sources that it has loaded, even if the files change.
     /// klippy's RESTART keeps the process. A host whose sources could not be read is inspected again.
-    last: Option<(Process, DialectName)>,
+    last: Option<(Process, HostForms)>,
+    /// The process that had the terminal open before, as long as it lives. `None` if nobody knows.
+    before: Option<Process>,
+    /// That process is gone, and the present one is another.
+    is_other: bool,
     /// The same host, for the status.
     host: Option<FoundHost>,
     say: Say,
 }
 
 impl Looker {
-    fn look(&mut self, terminal: Terminal) -> (DialectName, Option<FoundHost>) {
+    /// Notes whether the process that has the terminal open is another than before. A process that only looks in while
+    /// the host lives is none.
+    fn meet(&mut self, process: &Process) {
+        let is_gone = self.before.as_ref().map(is_gone);
+        self.is_other = is_gone == Some(true);
+        if is_gone != Some(false) {
+            self.before = Some(process.clone());
+        }
+    }
+
+    fn look(&mut self, terminal: Terminal) -> (Option<HostForms>, Option<FoundHost>) {
         let began = Instant::now();
-        let unknown = (DialectName::Union, None);
+        let unknown = (None, None);
+        self.is_other = false;
+        let search = find(Path::new(PROC), terminal);
+        match &search {
+            Ok(Search::Found(process)) => self.meet(process),
+            _ => self.before = None,
+        }
         let say = &mut self.say;
-        let (process, is_sure) = match find(Path::new(PROC), terminal) {
+        let (process, is_sure) = match search {
             Ok(Search::Found(process)) => (process, true),
             // The host is one of these, and all of them run from the same sources.
             Ok(Search::Hidden(mut processes)) if same_folder(&processes) => (processes.remove(0), false),
@@ -144,19 +161,29 @@ impl Looker {
                 return unknown;
             }
         };
-        if let Some((last, dialect)) = &self.last
-            && (last.pid, last.started) == (process.pid, process.started)
+        if let Some((last, forms)) = &self.last
+            && is_same(last, &process)
         {
-            say.info(format!("the host is the one of before, process {}: dialect {dialect}", process.pid));
-            return (*dialect, self.host.clone());
+            say.info(format!("the host is the one of before, process {}", process.pid));
+            return (Some(forms.clone()), self.host.clone());
         }
         let mut host =
             FoundHost { pid: process.pid, is_sure, is_attach: process.is_attach(), checkout: None, commit: None };
-        let found = dialect_of(&process, &mut host, began, say);
+        let forms = forms_of(&process, &mut host, began, say);
         self.host = Some(host);
-        self.last = found.map(|dialect| (process, dialect));
-        (found.unwrap_or(DialectName::Union), self.host.clone())
+        self.last = forms.clone().map(|forms| (process, forms));
+        (forms, self.host.clone())
     }
+}
+
+/// Whether this is one process.
+fn is_same(one: &Process, other: &Process) -> bool {
+    (one.pid, one.started) == (other.pid, other.started)
+}
+
+/// Whether a process has ended. A process that nobody waits for has no command line.
+fn is_gone(process: &Process) -> bool {
+    process::of(Path::new(PROC), process.pid).is_none_or(|now| !is_same(&now, process) || now.arguments.is_empty())
 }
 
 /// Whether there are processes, and all of them run from one folder.
@@ -171,9 +198,9 @@ fn union(remedy: &str) -> String {
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")
 }
 
-/// The dialect of a process, or `None` if it is unknown. It logs a line that says why, and notes in `host` where the
-/// process runs from.
-fn dialect_of(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<DialectName> {
+/// The forms that a process looks up, or `None` if they are unknown. It logs a line that says why, and notes in `host`
+/// where the process runs from.
+fn forms_of(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<HostForms> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
         let remedy = "for an older one name its --dialect";
@@ -200,33 +227,33 @@ fn dialect_of(process: &Process, host: &mut FoundHost, began: Instant, say: &mut
     if let Some(unread) = &checkout.unread {
         say.warn(format!("not all of the host's sources can be read, and what those need may not work: {unread}"));
     }
-    let best = checkout.best();
     let inside = checkout.folder.strip_prefix(format!("{PROC}/{pid}/root")).unwrap_or(&checkout.folder);
     let inside = Path::new("/").join(inside);
     (host.checkout, host.commit) = (Some(inside.display().to_string()), checkout.commit.clone());
+    let missing = checkout.missing(&Forms::Host(checkout.forms.clone()), FEATURES);
+    let gets = match missing.len() {
+        0 => "each message".to_owned(),
+        missing => format!("all but {missing} messages"),
+    };
     say.info(format!(
-        "the host is {}klippy of {}{}, process {pid}: dialect {}, which has {} of the {} messages that it looks up (found in {} ms)",
+        "the host is {}klippy of {}{}, process {pid}: it gets {gets} that it looks up (found in {} ms)",
         if host.is_sure { "" } else { "probably the " },
         inside.display(),
         checkout.commit.as_ref().map_or(String::new(), |commit| format!(" ({commit})")),
-        best.dialect,
-        best.served.len(),
-        best.served.len() + best.other.len(),
         began.elapsed().as_millis(),
     ));
-    let unknown: Vec<&str> = checkout.unknown().map(|shape| shape.as_str()).collect();
-    if !unknown.is_empty() {
-        let more = unknown.len().saturating_sub(UNKNOWN_SHOWN);
-        let more = if more == 0 { String::new() } else { format!("; and {more} more") };
+    if !missing.is_empty() {
+        let parts = parts_without(&missing);
+        let parts = if parts.is_empty() { String::new() } else { format!(" for {parts}") };
         say.warn(format!(
-            "the host is newer than Pinion, and does not work where it needs these forms of messages: {}{more}: update Pinion (pinion doctor --klipper DIR says more)",
-            unknown[..unknown.len().min(UNKNOWN_SHOWN)].join("; ")
+            "the host is newer than Pinion and does not get messages that it needs{parts}: {}: update Pinion (pinion doctor --klipper DIR says more)",
+            names(&missing)
         ));
     }
     if started(process).is_some_and(|started| started < checkout.newest) {
         say.warn(format!("the host's sources are newer than its process {pid}: restart klipper, so that both are one"));
     }
-    Some(best.dialect)
+    Some(checkout.forms)
 }
 
 /// When a process was started, in wall-clock time.

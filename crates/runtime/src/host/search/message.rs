@@ -8,7 +8,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::host::klippy::terminal::Terminal;
-use pinion_firmware::mcu::DialectName;
+use pinion_firmware::mcu::{DialectName, Forms, HostForms};
 use pinion_linux::foreign::plain;
 
 use crate::status::FoundHost;
@@ -46,8 +46,10 @@ pub(super) struct Line {
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Answer {
     pub(super) number: u32,
-    /// Written as [`DialectName`] writes it.
-    dialect: String,
+    /// The places of the forms that the host looks up. `None` if they are unknown.
+    forms: Option<Vec<u16>>,
+    /// The process of the host before is gone, and this is another one.
+    pub(super) is_other: bool,
     pub(super) host: Option<FoundHost>,
     pub(super) lines: Vec<Line>,
 }
@@ -62,13 +64,21 @@ fn bounded(text: &str, chars_max: usize) -> String {
 }
 
 impl Answer {
-    pub(super) fn new(number: u32, dialect: DialectName, host: Option<FoundHost>, lines: Vec<Line>) -> Answer {
-        Answer { number, dialect: dialect.to_string(), host, lines }.bounded()
+    pub(super) fn new(
+        number: u32,
+        forms: Option<&HostForms>,
+        is_other: bool,
+        host: Option<FoundHost>,
+        lines: Vec<Line>,
+    ) -> Answer {
+        let forms = forms.map(|forms| forms.places().collect());
+        Answer { number, forms, is_other, host, lines }.bounded()
     }
 
-    /// The dialect. It is the union, which most hosts accept, if this program does not know it.
-    pub(super) fn dialect(&self) -> DialectName {
-        self.dialect.parse().unwrap_or(DialectName::Union)
+    /// The forms for the host. Unknown hosts get the union, which most hosts accept. Any places make a dictionary.
+    pub(super) fn forms(&self) -> Forms {
+        let places = self.forms.as_ref().map(|places| places.iter().copied().collect());
+        places.map_or(Forms::Dialect(DialectName::Union), Forms::Host)
     }
 
     /// The same answer without anything that is too long or may not be shown.
@@ -110,7 +120,7 @@ impl Answer {
 pub fn search(bytes: &[u8]) {
     if let Some(answer) = Answer::decode(bytes) {
         answer.assert_bounded();
-        let _ = answer.dialect();
+        let _ = answer.forms();
     }
     let _ = serde_json::from_slice::<Question>(bytes);
     let _ = serde_json::from_slice::<Hello>(bytes);
@@ -131,10 +141,10 @@ mod tests {
             let host = FoundHost { pid, is_sure, is_attach: is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
             let line = || Line { is_warning: is_sure, text: text.clone() };
             let lines = (0..lines).map(|_| line()).collect();
-            let sent = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };
+            let sent = Answer { number: pid, forms: None, is_other: is_sure, host: Some(host), lines };
             // Anything may come over the socket.
             let heard = Answer::decode(&serde_json::to_vec(&sent).unwrap()).unwrap();
-            prop_assert_eq!(heard.dialect(), DialectName::Union);
+            prop_assert_eq!(heard.forms(), Forms::Dialect(DialectName::Union));
             heard.assert_bounded();
         }
 
@@ -145,12 +155,15 @@ mod tests {
     }
 
     #[test]
-    fn a_dialect_is_one_that_is_known() {
-        let answer = |dialect: &str| {
-            Answer::decode(format!(r#"{{"number":1,"dialect":"{dialect}","host":null,"lines":[]}}"#).as_bytes())
+    fn forms_are_those_that_the_host_looks_up() {
+        let answer = |forms: &str| {
+            Answer::decode(
+                format!(r#"{{"number":1,"forms":{forms},"is_other":false,"host":null,"lines":[]}}"#).as_bytes(),
+            )
         };
-        assert_eq!(answer("v0.12").unwrap().dialect().to_string(), "v0.12");
-        assert_eq!(answer("v0.10").unwrap().dialect(), DialectName::Union);
+        assert_eq!(answer("[3,1,65535]").unwrap().forms(), Forms::Host([1, 3, 65535].into_iter().collect()));
+        assert_eq!(answer("null").unwrap().forms(), Forms::Dialect(DialectName::Union));
+        assert!(answer("[65536]").is_none() && answer("[-1]").is_none());
         assert!(Answer::decode(b"{}").is_none() && Answer::decode("[".repeat(10_000).as_bytes()).is_none());
     }
 }

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dialect that the host speaks. It looks for the process that has the pty open, and for its sources.
+//! Finds the forms of messages that the host looks up. It looks for the process that has the pty open, and for its sources.
 //!
 //! That takes capabilities that open every file and every process of the computer. And it reads files that a host has
 //! written. So a process of its own does it, forked before the program has threads. That process keeps only these
 //! capabilities. Its only descriptor is the socket to the program. The kernel lets it read files and nothing more
-//! (`sys/filter.rs`). It gets a terminal's number. It answers with a dialect, the host that it found, and lines for the
+//! (`sys/filter.rs`). It gets a terminal's number. It answers with forms, the host that it found, and lines for the
 //! log. The program keeps none of those capabilities, and trusts no answer.
 //!
 //! This file is the program's side. `looker.rs` is the process. `message.rs` has the messages between them.
@@ -25,7 +25,7 @@ use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, recv, send, 
 use nix::sys::time::{TimeVal, TimeValLike as _};
 
 use crate::host::klippy::terminal::Terminal;
-use pinion_firmware::mcu::DialectName;
+use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
 
@@ -87,12 +87,25 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
     }
 }
 
+/// What the search found out about a host.
+pub(crate) struct Found {
+    /// The forms of messages for it.
+    pub(crate) forms: Forms,
+    /// The process of the host before is gone, and this is another one.
+    pub(crate) is_other: bool,
+}
+
+impl Found {
+    /// Nothing is known.
+    const NOTHING: Found = Found { forms: Forms::Dialect(DialectName::Union), is_other: false };
+}
+
 /// The link's way to the search. A thread receives the answers.
 pub(crate) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
     board: Arc<HostStatus>,
-    answers: Receiver<(u32, DialectName)>,
+    answers: Receiver<(u32, Found)>,
     /// The number of the last question.
     asked: u32,
     /// The last question waits until the search has answered the one before it. A host may come and go at any rate, and
@@ -122,9 +135,9 @@ impl HostFinder {
                 for line in &answer.lines {
                     log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
                 }
-                let dialect = answer.dialect();
+                let found = Found { forms: answer.forms(), is_other: answer.is_other };
                 shown.found(answer.host);
-                let sent = sender.send((answer.number, dialect));
+                let sent = sender.send((answer.number, found));
                 wake.wake();
                 if sent.is_err() {
                     return;
@@ -137,7 +150,7 @@ impl HostFinder {
         Ok(HostFinder { socket, terminal, board, answers, asked: 0, waits: false, is_busy: false })
     }
 
-    /// Asks for the dialect of the host that came just now, on the terminal `device`.
+    /// Asks for the forms of the host that came just now, on the terminal `device`.
     pub(crate) fn ask(&mut self, device: Option<&Path>) {
         if let Some(Ok(terminal)) = device.map(Terminal::of) {
             self.terminal = terminal;
@@ -150,17 +163,17 @@ impl HostFinder {
     }
 
     /// The answer to the last question, if it has come.
-    pub(crate) fn answer(&mut self) -> Option<DialectName> {
+    pub(crate) fn answer(&mut self) -> Option<Found> {
         loop {
             match self.answers.try_recv() {
-                Ok((number, dialect)) => {
+                Ok((number, found)) => {
                     self.is_busy = false;
                     if number == self.asked {
-                        return Some(dialect);
+                        return Some(found);
                     }
                 }
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => return Some(DialectName::Union),
+                Err(TryRecvError::Disconnected) => return Some(Found::NOTHING),
             }
         }
         if self.waits && !self.is_busy {
@@ -190,18 +203,18 @@ mod tests {
             question.number
         };
         let answer = |number: u32| {
-            let answer = Answer::new(number, DialectName::Kalico, None, Vec::new());
+            let answer = Answer::new(number, None, true, None, Vec::new());
             send(search.as_raw_fd(), &serde_json::to_vec(&answer).unwrap(), MsgFlags::empty()).unwrap();
         };
         assert_eq!(number(), 1);
         answer(1);
         while finder.is_busy && finder.waits {
-            assert_eq!(finder.answer(), None);
+            assert!(finder.answer().is_none());
             thread::yield_now();
         }
         assert_eq!(number(), 1000);
         answer(1000);
-        let found = std::iter::repeat_with(|| finder.answer()).find_map(|found| found);
-        assert_eq!(found, Some(DialectName::Kalico));
+        let found = std::iter::repeat_with(|| finder.answer()).find_map(|found| found).unwrap();
+        assert!(found.is_other, "it is the search's answer");
     }
 }
