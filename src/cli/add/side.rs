@@ -149,8 +149,10 @@ impl<'a> Side<'a> {
                     Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
                     found => found?,
                 };
-                drop(folder.create(&fresh(&name))?);
-                fs::remove_file(folder.at(fresh(&name)))
+                // Another pinion add may write now.
+                let own = format!("{}.{}", fresh(&name), std::process::id());
+                drop(folder.create(&own)?);
+                fs::remove_file(folder.at(own))
             };
             probed().map_err(|error| failed(&file, &error))?;
         }
