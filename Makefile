@@ -198,7 +198,7 @@ sanitize: system-packages-build
 	@CARGO='$(CARGO)' scripts/sanitize
 
 bench: system-packages-build
-	'$(CARGO)' bench --locked
+	'$(CARGO)' bench --locked --package pinion-benches
 
 check: system-packages-check
 	'$(CARGO)' fmt --all --check

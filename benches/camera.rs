@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The cost of a picture of the simulated printer: `cargo bench --bench camera`. At 15 pictures a second, 1 ms for a
+//! The cost of a picture of the simulated printer: `cargo bench -p pinion-benches --bench camera`. At 15 pictures a second, 1 ms for a
 //! picture is 1.5 % of a processor.
 
 use std::f64::consts::TAU;

@@ -122,7 +122,8 @@ fn a_trial_that_root_starts_runs_klippy_without_rights_and_takes_it_along() {
     let cfg = home.join("printer.cfg");
     fs::write(&cfg, PRINTER).unwrap();
     [&home, &cfg].into_iter().for_each(|path| give(path));
-    let folder = home.join("sim");
+    // In root's folder: it is made for the trial's user.
+    let folder = root.path().join("sim");
     let mut trial = Command::new(&program);
     trial.arg("sim").arg(&cfg).args(["--try", "--python", "/bin/sh", "--klipper"]).arg(root.path().join("klipper"));
     trial.arg("--folder").arg(&folder).env_remove("SUDO_UID").stdout(Stdio::null()).stderr(Stdio::null());

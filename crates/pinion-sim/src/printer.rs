@@ -104,7 +104,10 @@ impl Owner {
 
 /// A trial runs the programs in a printer.cfg, so root's rights are left before it.
 fn leave_root(args: &SimArgs, printer_cfg: &Path) -> Result<(), Trouble> {
-    if args.own.attempt { attempt::rights::leave_root(printer_cfg, args.realtime) } else { Ok(()) }
+    if !args.own.attempt {
+        return Ok(());
+    }
+    attempt::rights::leave_root(printer_cfg, args.own.folder.as_deref(), args.realtime)
 }
 
 /// Shows the printer at work and continues to serve it, or prints its configuration.

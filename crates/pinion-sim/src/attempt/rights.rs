@@ -4,24 +4,26 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, chown};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use nix::unistd::{Uid, User, geteuid};
+use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::Trouble;
 
 /// The user and the group "nobody" of Debian.
 const NOBODY: u32 = 65_534;
 
 /// Starts this program anew as an ordinary user, if root runs it: as the one who called sudo, or as the owner of the
-/// printer.cfg, or as nobody. It keeps the right to real time if `realtime`.
+/// printer.cfg, or as nobody. `folder` becomes that user's, if it is new or empty. With `realtime` the program keeps the
+/// right to real time.
 ///
 /// # Errors
 ///
-/// The program cannot be started.
-pub(crate) fn leave_root(printer_cfg: &Path, realtime: bool) -> Result<(), Trouble> {
+/// The folder is another user's. The program cannot be started.
+pub(crate) fn leave_root(printer_cfg: &Path, folder: Option<&Path>, realtime: bool) -> Result<(), Trouble> {
     if !geteuid().is_root() {
         return Ok(());
     }
@@ -34,6 +36,14 @@ pub(crate) fn leave_root(printer_cfg: &Path, realtime: bool) -> Result<(), Troub
         let cause = format!("the trial cannot leave root's rights: {error}");
         Trouble::new(cause).remedy("install util-linux, or run it as an ordinary user")
     };
+    if let Some(folder) = folder {
+        give(folder, uid, gid).map_err(|error| {
+            Trouble::new(error.to_string()).of(folder.display()).remedy("name a new folder in a folder of yours")
+        })?;
+    }
+    let name = user.as_ref().map_or_else(|| uid.to_string(), |user| user.name.clone());
+    log::info!("the trial leaves root's rights: it runs as {name}");
+    pinion::cli::logging::finish();
     let program = std::env::current_exe().map_err(failed)?;
     let mut setpriv = Command::new("setpriv");
     setpriv.arg(format!("--reuid={uid}")).arg(format!("--regid={gid}"));
@@ -46,6 +56,19 @@ pub(crate) fn leave_root(printer_cfg: &Path, realtime: bool) -> Result<(), Troub
     setpriv.env_remove("STATE_DIRECTORY").env_remove("XDG_STATE_HOME").env_remove("XDG_RUNTIME_DIR");
     setpriv.env("HOME", user.map_or_else(|| "/nonexistent".into(), |user| user.dir));
     Err(failed(setpriv.exec()))
+}
+
+/// Gives a folder to a user, if it is new or empty. One with files is that user's already, or is refused later.
+fn give(folder: &Path, uid: u32, gid: u32) -> io::Result<()> {
+    let own = match OwnFolder::make(folder) {
+        // That of an earlier trial.
+        Err(_) if fs::symlink_metadata(folder).is_ok_and(|about| about.is_dir() && about.uid() == uid) => return Ok(()),
+        made => made?,
+    };
+    if fs::read_dir(own.at("."))?.next().is_none() {
+        chown(own.at("."), Some(uid), Some(gid))?;
+    }
+    Ok(())
 }
 
 /// The user of a trial that root starts, from the caller of sudo and the owner of the printer.cfg.
