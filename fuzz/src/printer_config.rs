@@ -15,9 +15,14 @@ impl Files for Memory {
         found.map(|(_, text)| text.clone()).ok_or(io::ErrorKind::NotFound.into())
     }
 
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        let all = pattern.to_string_lossy().contains('*');
-        Ok(self.0.iter().map(|(name, _)| name.clone()).filter(|name| all || name == pattern).collect())
+    fn names(&self, folder: &Path, most: usize) -> Vec<String> {
+        let paths = self.0.iter().map(|(path, _)| path);
+        let inside = paths.filter(|path| path.parent() == Some(folder));
+        inside.filter_map(|path| path.file_name()?.to_str().map(str::to_owned)).take(most).collect()
+    }
+
+    fn is_there(&self, path: &Path) -> bool {
+        self.0.iter().any(|(name, _)| name == path)
     }
 
     fn whole(&self, path: &Path) -> PathBuf {

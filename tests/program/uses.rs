@@ -4,9 +4,10 @@
 
 use std::fs;
 
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt, lchown, symlink};
 use std::process::{Command, Output};
 
+use pinion_testkit::here;
 use serde_json::Value;
 
 use crate::add::{CONFIG_TXT, Card, PRINTER, PRINTER_CFG, end, moonraker};
@@ -565,4 +566,54 @@ fn an_undo_for_one_printer_leaves_the_other_one_s_bus() {
     let told = card.added(&["adxl345", "--yes", "--undo", "--config", &config]);
     assert!(told.contains(&format!("keeps \"dtparam=spi=on\": [lis2dw] (/{second}) needs it")), "{told}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
+}
+
+/// The sections cannot be written, so the bus is not enabled, either.
+#[test]
+fn config_txt_stays_if_printer_cfg_cannot_change() {
+    let card = Card::pi();
+    fs::set_permissions(card.path(PRINTER), fs::Permissions::from_mode(0o444)).unwrap();
+    let before = card.snapshot();
+    let log = card.refused(&["adxl345", "--yes"]);
+    assert!(log.contains("printer.cfg is read-only: chmod u+w "), "{log}");
+    assert_eq!(card.snapshot(), before);
+    // Nobody knows which printer is meant.
+    card.put("home/other/printer_data/config/printer.cfg", PRINTER_CFG);
+    let before = card.snapshot();
+    let log = card.refused(&["adxl345", "--yes"]);
+    assert!(log.contains("there are several hosts"), "{log}");
+    assert_eq!(card.snapshot(), before);
+}
+
+/// The user's printer.cfg includes a file of root's. One line is no option, so klippy's error quotes it.
+#[test]
+fn root_s_commands_print_no_line_that_the_owner_of_printer_cfg_may_not_read() {
+    if !here::is_root() {
+        return;
+    }
+    let card = Card::pi().with_printer("[include /srv/secret.cfg]\n");
+    card.put("srv/secret.cfg", "[x]\nwords of root\n");
+    card.put(
+        "etc/systemd/system/klipper.service",
+        &format!("[Service]\nExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /{PRINTER}\n"),
+    );
+    fs::set_permissions(card.path(""), fs::Permissions::from_mode(0o755)).unwrap();
+    fs::set_permissions(card.path("srv/secret.cfg"), fs::Permissions::from_mode(0o600)).unwrap();
+    let told = card.doctor();
+    assert!(told.contains("words of root"), "the owner is root: {told}");
+    lchown(card.path(PRINTER), Some(65_534), Some(65_534)).unwrap();
+    for told in [card.doctor(), card.pins(&[]), card.refused(&["relay", "--dry-run"])] {
+        assert!(!told.contains("words of root"), "{told}");
+    }
+    assert!(card.doctor().contains("secret.cfg: Unable to open config file: Permission denied"));
+}
+
+#[test]
+fn the_command_for_a_second_device_has_one_name() {
+    let card = Card::pi().with_printer(&format!("{HOST}[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.0\n"));
+    let told = card.added(&["lis2dw", "--name", "bed", "--dry-run"]);
+    assert!(told.contains(&format!("sudo pinion add lis2dw --root {} --name NAME", card.root())), "{told}");
+    // Without klippy's unit, the doctor looks in the usual places.
+    let told = card.doctor();
+    assert!(told.contains("[lis2dw bed] in printer.cfg needs /dev/spidev0.0"), "{told}");
 }

@@ -37,6 +37,8 @@ const FAREWELL_MAX: usize = 256 * 1024;
 const SEND_BUFFER: usize = 128 * 1024;
 /// How long to wait if the computer has no room for a further connection.
 const PAUSE: Duration = Duration::from_millis(100);
+/// How long a request may take while no place is free for another client.
+const HASTE: Duration = Duration::from_millis(200);
 /// A thread for a connection needs little.
 const STACK: usize = 256 * 1024;
 /// A line between two frames. mjpg-streamer has the same, and some programs look for it.
@@ -106,7 +108,8 @@ pub fn serve(
             thread::sleep(PAUSE);
             continue;
         };
-        let connection = Connection { stream, studio: studio.clone(), streams: streams.clone(), is_local, limits };
+        let (studio, connections, streams) = (studio.clone(), connections.clone(), streams.clone());
+        let connection = Connection { stream, studio, connections, streams, is_local, limits };
         let viewer = move || {
             // Nobody misses an answer to a viewer that is gone.
             let _ = connection.answer();
@@ -138,6 +141,10 @@ impl Places {
         let mut free = self.freed.wait_while(free, |free| *free == 0).unwrap_or_else(PoisonError::into_inner);
         *free -= 1;
         Place(self.clone())
+    }
+
+    fn are_taken(&self) -> bool {
+        *self.free.lock().unwrap_or_else(PoisonError::into_inner) == 0
     }
 
     /// A place, if one is free.
@@ -186,6 +193,7 @@ const NO_FRAME: Refusal = Refusal("503 Service Unavailable", "No picture can be 
 struct Connection {
     stream: TcpStream,
     studio: Arc<Studio>,
+    connections: Arc<Places>,
     streams: Arc<Places>,
     /// Whether only this computer can connect.
     is_local: bool,
@@ -302,19 +310,23 @@ impl Connection {
         Ok(())
     }
 
-    /// Reads a request. `None` if the client goes without one.
+    /// Reads a request. `None` if the client goes without one, or if it is slow and others wait for its place.
     fn request(&self) -> io::Result<Option<Result<Request, Refusal>>> {
-        let end = Instant::now() + self.limits.request;
+        let begin = Instant::now();
         let (mut bytes, mut length) = ([0; REQUEST_MAX], 0);
         loop {
-            let Ok(left) = left_until(end) else { return Ok(Some(Err(TIMEOUT))) };
-            self.stream.set_read_timeout(Some(left))?;
+            if begin.elapsed() >= HASTE && self.connections.are_taken() {
+                return Ok(None);
+            }
+            let Ok(left) = left_until(begin + self.limits.request) else { return Ok(Some(Err(TIMEOUT))) };
+            self.stream.set_read_timeout(Some(left.min(HASTE)))?;
             match (&self.stream).read(&mut bytes[length..]) {
                 Ok(0) if length == 0 => return Ok(None),
                 Ok(0) => return Ok(Some(Err(BAD_REQUEST))),
                 Ok(count) => length += count,
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(Some(Err(TIMEOUT))),
+                Err(error) if [io::ErrorKind::Interrupted, io::ErrorKind::WouldBlock].contains(&error.kind()) => {
+                    continue;
+                }
                 Err(error) => return Err(error),
             }
             match parse(&bytes[..length]) {

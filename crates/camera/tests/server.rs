@@ -292,6 +292,15 @@ fn a_request_that_comes_letter_by_letter_is_given_up() {
     }
 }
 
+/// Each may wait for a minute, and they take more places than there are.
+#[test]
+fn slow_clients_keep_no_place_that_another_client_needs() {
+    let camera = Camera::start();
+    let slow: Vec<TcpStream> = (0..150).map(|_| camera.sent("GET /snap")).collect();
+    assert_jpeg(&camera.get("/snapshot").1);
+    drop(slow);
+}
+
 #[test]
 fn pages_of_the_internet_cannot_read_what_is_for_this_computer() {
     let request = |origin: &str| format!("GET /snapshot HTTP/1.1\r\nHost: localhost\r\nOrigin: {origin}\r\n\r\n");

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The files of a configuration: how they are read, and how an include's pattern finds them.
 
-use std::ffi::OsStr;
 use std::fs;
 use std::io;
 use std::path::{Component, Path, PathBuf};
@@ -11,8 +10,8 @@ use pinion_linux::foreign;
 
 /// Longest file.
 const FILE_MAX: u64 = 4 << 20;
-/// Highest number of names that an include's pattern looks at.
-const NAMES_MAX: usize = 20_000;
+/// Highest number of names that all patterns of a configuration look at.
+pub const NAMES_MAX: usize = 100_000;
 
 /// A place with files.
 pub trait Files {
@@ -23,12 +22,11 @@ pub trait Files {
     /// It cannot be read, or is no configuration.
     fn text(&self, path: &Path) -> io::Result<String>;
 
-    /// The paths that exist and that match a pattern of Python's `glob.glob`, sorted as klippy sorts them.
-    ///
-    /// # Errors
-    ///
-    /// It would look at too many names.
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>>;
+    /// The names in a folder, in any order, but no more than `most`. Empty if it cannot be read.
+    fn names(&self, folder: &Path, most: usize) -> Vec<String>;
+
+    /// Whether a pattern may find this path.
+    fn is_there(&self, path: &Path) -> bool;
 
     /// The same path for two names of one file, as Python's `os.path.abspath` makes it.
     fn whole(&self, path: &Path) -> PathBuf;
@@ -48,24 +46,14 @@ impl Files for Disk {
         String::from_utf8(bytes).map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is no UTF-8 text"))
     }
 
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        let mut found = vec![PathBuf::new()];
-        let mut names = 0;
-        for component in pattern.components() {
-            let literal = match component {
-                Component::Normal(name) => name.to_str().filter(|name| is_pattern(name)),
-                _ => None,
-            };
-            found = match literal.map(Pattern::new) {
-                Some(Ok(pattern)) => expand(&found, &pattern, &mut names)?,
-                // Python takes a wrong pattern as a name.
-                Some(Err(_)) | None => found.into_iter().map(|path| path.join(component)).collect(),
-            };
-        }
+    fn names(&self, folder: &Path, most: usize) -> Vec<String> {
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+        names_in(folder, most)
+    }
+
+    fn is_there(&self, path: &Path) -> bool {
         // Python finds a link that leads nowhere, too.
-        found.retain(|path| path.symlink_metadata().is_ok());
-        found.sort();
-        Ok(found)
+        path.symlink_metadata().is_ok()
     }
 
     fn whole(&self, path: &Path) -> PathBuf {
@@ -75,7 +63,7 @@ impl Files for Disk {
 }
 
 /// Whether Python's `glob.has_magic` says that a name is a pattern.
-pub(crate) fn is_pattern(name: &str) -> bool {
+pub fn is_pattern(name: &str) -> bool {
     name.contains(['*', '?', '['])
 }
 
@@ -93,23 +81,44 @@ pub(crate) fn normal(path: &Path) -> PathBuf {
     whole
 }
 
-/// The names in these folders that match.
-fn expand(folders: &[PathBuf], pattern: &Pattern, names: &mut usize) -> io::Result<Vec<PathBuf>> {
+/// The names in a folder of this computer, but no more than `most`.
+pub fn names_in(folder: &Path, most: usize) -> Vec<String> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten().take(most);
+    entries.filter_map(|entry| entry.file_name().into_string().ok()).collect()
+}
+
+/// The paths that match a pattern of Python's `glob.glob`, sorted as klippy sorts them. Each folder and each name in it
+/// takes one of `names_left`.
+///
+/// # Errors
+///
+/// No names are left.
+pub fn matching(files: &dyn Files, pattern: &Path, names_left: &mut usize) -> io::Result<Vec<PathBuf>> {
     let options = MatchOptions { require_literal_leading_dot: true, ..MatchOptions::new() };
-    let mut found = Vec::new();
-    for folder in folders {
-        let place = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-        let Ok(entries) = fs::read_dir(place) else { continue };
-        for entry in entries.flatten() {
-            *names += 1;
-            if *names > NAMES_MAX {
-                return Err(io::Error::other(format!("its pattern looks at more than {NAMES_MAX} names")));
+    let mut found = vec![PathBuf::new()];
+    for component in pattern.components() {
+        let name = match component {
+            Component::Normal(name) => name.to_str().filter(|name| is_pattern(name)),
+            _ => None,
+        };
+        // Python takes a wrong pattern as a name.
+        let Some(pattern) = name.and_then(|name| Pattern::new(name).ok()) else {
+            found.iter_mut().for_each(|path| path.push(component));
+            continue;
+        };
+        let mut inside = Vec::new();
+        for folder in found {
+            let names = files.names(&folder, *names_left);
+            *names_left = names_left.saturating_sub(names.len() + 1);
+            if *names_left == 0 {
+                return Err(io::Error::other(format!("the patterns look at more than {NAMES_MAX} names")));
             }
-            let name = entry.file_name();
-            if name.to_str().is_some_and(|name| pattern.matches_with(name, options)) {
-                found.push(folder.join::<&OsStr>(&name));
-            }
+            let matches = names.iter().filter(|name| pattern.matches_with(name, options));
+            inside.extend(matches.map(|name| folder.join(name)));
         }
+        found = inside;
     }
+    found.retain(|path| files.is_there(path));
+    found.sort();
     Ok(found)
 }

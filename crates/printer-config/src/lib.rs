@@ -25,7 +25,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 use std::sync::Arc;
 
-pub use files::{Disk, Files};
+pub use files::{Disk, Files, NAMES_MAX, is_pattern, matching, names_in};
 pub use parse::included;
 pub use pinion_firmware::trouble::Trouble;
 pub use values::Limit;

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::files::{Disk, Files, is_pattern};
+use crate::files::{Disk, Files, NAMES_MAX, is_pattern, matching};
 use crate::parse::{Line, included, uncommented};
 use crate::{Config, Include, Place, SourceFile, Trouble};
 
@@ -35,7 +35,8 @@ impl Config {
     ///
     /// Those of [`Config::read`].
     pub fn read_from(files: &dyn Files, path: &Path) -> Result<Config, Trouble> {
-        let mut reader = Reader { files, config: Config::default(), within: Vec::new(), opened: 0, bytes: 0 };
+        let (config, within) = (Config::default(), Vec::new());
+        let mut reader = Reader { files, config, within, opened: 0, bytes: 0, names_left: NAMES_MAX };
         let text = reader.text(path)?;
         let (usual, saved) = match text.find(SAVED).map(|at| text.split_at(at)) {
             Some((usual, block)) => match saved_lines(&block[SAVED.len()..]) {
@@ -120,6 +121,8 @@ struct Reader<'a> {
     within: Vec<PathBuf>,
     opened: usize,
     bytes: usize,
+    /// How many more names the patterns may look at.
+    names_left: usize,
 }
 
 impl Reader<'_> {
@@ -172,7 +175,7 @@ impl Reader<'_> {
             );
         }
         let pattern = place.file.parent().unwrap_or(Path::new("")).join(pattern);
-        let found = self.files.matching(&pattern).map_err(|error| {
+        let found = matching(self.files, &pattern, &mut self.names_left).map_err(|error| {
             Trouble::new(format!("Include file '{}': {error}", pattern.display())).remedy("name fewer files")
         })?;
         if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) {

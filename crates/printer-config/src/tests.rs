@@ -18,10 +18,16 @@ impl Files for Memory {
     fn text(&self, path: &Path) -> io::Result<String> {
         self.0.get(path).cloned().ok_or(io::ErrorKind::NotFound.into())
     }
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        let pattern = glob::Pattern::new(&pattern.to_string_lossy()).unwrap();
-        Ok(self.0.keys().filter(|path| pattern.matches_path(path)).cloned().collect())
+    fn names(&self, folder: &Path, most: usize) -> Vec<String> {
+        let paths = self.0.keys();
+        let inside = paths.filter(|path| path.parent() == Some(folder));
+        inside.filter_map(|path| path.file_name()?.to_str().map(str::to_owned)).take(most).collect()
     }
+
+    fn is_there(&self, path: &Path) -> bool {
+        self.0.contains_key(path)
+    }
+
     fn whole(&self, path: &Path) -> PathBuf {
         normal(path)
     }
@@ -244,4 +250,15 @@ fn a_copy_without_a_section_has_none_of_its_lines() {
     let again = Config::read(&copied).unwrap();
     assert!(again.section("a").is_none());
     assert_eq!(again.section("b").unwrap().text("z_offset"), Some("1.5"), "the block counts");
+}
+
+/// Each of them finds nothing, and has to look at all names.
+#[test]
+fn many_patterns_do_not_keep_a_reader_busy() {
+    let names: Vec<String> = (0..200).map(|n| format!("d/{n}.cfg")).collect();
+    let text = "[include x*.cfg]\n".repeat(990);
+    let mut files: Vec<(&str, &str)> = vec![("d/p.cfg", &text)];
+    files.extend(names.iter().map(|name| (name.as_str(), "")));
+    let error = read_all(&files).map(drop).unwrap_err();
+    assert!(error.contains("the patterns look at more than 100000 names"), "{error}");
 }

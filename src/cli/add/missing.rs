@@ -30,7 +30,12 @@ pub(in crate::cli) fn missing(computer: &Computer, configs: &BTreeSet<PathBuf>) 
         };
         Some(Finding::error("device", found, remedy))
     };
-    printers.flat_map(|printer| printer.config.sections().iter().filter_map(finding).collect::<Vec<_>>()).collect()
+    let of_printer = |printer: Printer| {
+        let own = printer.own_mcus(computer, None);
+        let sections = printer.config.sections().iter().filter(|section| printer.is_on(section, &own));
+        sections.filter_map(finding).collect::<Vec<_>>()
+    };
+    printers.flat_map(of_printer).collect()
 }
 
 /// The file of a bus or a sensor that an option names.
@@ -55,7 +60,7 @@ mod tests {
     #[test]
     fn a_configured_device_without_its_bus_is_named_with_the_command_that_adds_it() {
         let tree = Tree::new();
-        tree.put("home/pi/printer.cfg", "[adxl345 bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n[temperature_sensor room]\nsensor_type: BME280\ni2c_bus: i2c.1\n[lis2dw]\nspi_bus: spidev0.0\n[tmc5160 stepper_x]\nspi_bus: spi1\n[temperature_sensor out]\nsensor_type: DS18B20\nserial_no: 28-0316a4f1ff27\n[neopixel strip]\npin: host:spidev9.0\n[sx1509 x]\ni2c_bus: i2c.7\n");
+        tree.put("home/pi/printer.cfg", "[mcu host]\nserial: /tmp/klipper_host_mcu\n[mcu other]\nserial: /tmp/klipper_host_other\n[adxl345 elsewhere]\ncs_pin: other:None\nspi_bus: spidev1.0\n[adxl345 bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n[temperature_sensor room]\nsensor_type: BME280\ni2c_mcu: host\ni2c_bus: i2c.1\n[lis2dw]\ncs_pin: host:None\nspi_bus: spidev0.0\n[tmc5160 stepper_x]\nspi_bus: spi1\n[temperature_sensor out]\nsensor_type: DS18B20\nserial_no: 28-0316a4f1ff27\n[neopixel strip]\npin: host:spidev9.0\n[sx1509 x]\ni2c_mcu: host\ni2c_bus: i2c.7\n");
         tree.put("dev/spidev0.0", "");
         let found = missing(&tree.computer(), &[PathBuf::from("/home/pi/printer.cfg"), "/none".into()].into());
         let remedies: Vec<(String, String)> = found

@@ -35,7 +35,6 @@ mod plan;
 mod printer;
 mod probe;
 mod report;
-mod rights;
 mod side;
 mod undo;
 mod work;

@@ -94,7 +94,7 @@ fn checksum(text: &str) -> u32 {
 }
 
 impl Target {
-    /// Finds printer.cfg, and reads it with the files that it includes, with its owner's rights.
+    /// Finds printer.cfg, and reads it with the files that it includes.
     ///
     /// # Errors
     ///
@@ -102,8 +102,7 @@ impl Target {
     pub(super) fn find(computer: &Computer, named: Option<&Path>, mcu: Option<&str>) -> Result<Target, String> {
         let file = find(computer, named)?;
         let path = named.and_then(|_| link_to(computer, &file)).unwrap_or_else(|| file.clone());
-        let folder = computer.resolve(file.parent().unwrap_or(Path::new("/"))).map_err(|error| error.to_string())?;
-        let about = std::fs::symlink_metadata(folder.join(file.file_name().unwrap_or_default()));
+        let about = computer.unfollowed(&file).and_then(std::fs::symlink_metadata);
         let about = about.map_err(|error| format!("{}: {error}: name yours with --config FILE", file.display()))?;
         if about.is_symlink() {
             let target = behind(computer, &file).map_or("FILE".into(), |file| word(file.display()));
@@ -112,7 +111,6 @@ impl Target {
         let owner = (about.uid(), about.gid());
         let side = Side::new(computer, Some(owner));
         let text = side.read(&file)?.unwrap_or_default();
-        let _rights = side.rights().map_err(|error| error.to_string())?;
         let printer = Printer::read(computer, &path).map_err(|trouble| trouble.to_string())?;
         let mcus = printer.own_mcus(computer, mcu);
         Ok(Target { path, file, owner, text, printer, mcus })
@@ -124,7 +122,7 @@ impl Target {
     ///
     /// One line: it is not known which Moonraker is this host's.
     pub(super) fn moonraker(&self, computer: &Computer) -> Result<String, String> {
-        let Ok(config) = Config::read_from(computer, &self.path.with_file_name("moonraker.conf")) else {
+        let Ok(config) = computer.config(&self.path.with_file_name("moonraker.conf")) else {
             return match configs(computer).len() {
                 0 | 1 => Ok(format!("127.0.0.1:{MOONRAKER_PORT}")),
                 _ => Err("there are several hosts: name the Moonraker of this one with --moonraker ADDRESS".into()),
@@ -171,17 +169,14 @@ impl Target {
         self.config().sections().iter().filter(|section| !self.is_in(section, own))
     }
 
-    /// The MCU of a section: that of its pins, or its `i2c_mcu`.
+    /// The MCU of a section.
     pub(super) fn mcu_of(&self, section: &Section) -> String {
-        let named = ["i2c_mcu", "sensor_mcu"].iter().find_map(|key| section.text(key)).map(str::to_owned);
-        named
-            .or_else(|| self.printer.pins_of(section).map(|named| named.pin.chip).next())
-            .unwrap_or_else(|| "mcu".into())
+        self.printer.mcu_of(section)
     }
 
-    /// Whether a section is on an MCU of this computer. 1-Wire is always.
+    /// Whether a section is on an MCU of this computer.
     pub(super) fn is_here(&self, section: &Section) -> bool {
-        section.text("serial_no").is_some() || self.mcus.contains_key(&self.mcu_of(section))
+        self.printer.is_on(section, &self.mcus)
     }
 
     /// The MCU of this computer, with its link, and whether it has to be added.

@@ -17,8 +17,8 @@ use std::path::{Path, PathBuf};
 use nix::fcntl::{Flock, FlockArg};
 use nix::unistd::geteuid;
 
-use super::rights::Rights;
 use crate::cli::computer::Computer;
+use crate::cli::computer::rights::Rights;
 use pinion_linux::foreign::{self, word};
 use pinion_linux::own_folder::OwnFolder;
 
@@ -73,7 +73,7 @@ impl<'a> Side<'a> {
         self.owner.is_none()
     }
 
-    pub(super) fn rights(&self) -> io::Result<Rights> {
+    fn rights(&self) -> io::Result<Rights> {
         Rights::of(self.owner)
     }
 
@@ -137,6 +137,26 @@ impl<'a> Side<'a> {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Fails if one of these files could not be replaced, and changes nothing.
+    pub(super) fn probe(&self, files: impl Iterator<Item = PathBuf>) -> Result<(), String> {
+        for file in files {
+            self.refuse_read_only(&file)?;
+            let probed = || {
+                let _rights = self.rights()?;
+                let (folder, name) = match self.folder(&file, false) {
+                    Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+                    found => found?,
+                };
+                // Another pinion add may write now.
+                let own = format!("{}.{}", fresh(&name), std::process::id());
+                drop(folder.create(&own)?);
+                fs::remove_file(folder.at(own))
+            };
+            probed().map_err(|error| failed(&file, &error))?;
+        }
+        Ok(())
     }
 
     fn remove(&self, file: &Path) -> io::Result<()> {

@@ -17,6 +17,7 @@ use super::side::Side;
 use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Board, Spot};
+use crate::cli::computer::printer::configs;
 use crate::cli::computer::running::Running;
 use crate::cli::files::Output;
 
@@ -63,6 +64,9 @@ impl Work<'_> {
         let (boot, mut state) = self.plan_boot()?;
         self.report.set("bus", json!(state.name()));
         if !boot.is_empty() {
+            if !self.args.dry_run {
+                self.refuse_half(target.as_ref())?;
+            }
             make(
                 self.args,
                 moonraker.as_deref(),
@@ -103,6 +107,19 @@ impl Work<'_> {
 
     pub(super) fn node(&self) -> &str {
         &self.spot.node
+    }
+
+    /// Fails if the sections could not be written: then the boot loader's settings stay as they are, too. Without any
+    /// printer.cfg, they are all that changes.
+    fn refuse_half(&self, target: Result<&Target, &String>) -> Result<(), String> {
+        match target {
+            Ok(target) => {
+                let own = target.file(&self.device.file(self.name()));
+                Side::new(self.computer, Some(target.owner)).probe(target.files().chain([target.path.clone(), own]))
+            }
+            Err(_) if configs(self.computer).is_empty() => Ok(()),
+            Err(why) => Err(why.clone()),
+        }
     }
 
     fn draw(&mut self, wires: &[Wire]) -> Result<(), String> {
@@ -162,7 +179,7 @@ impl Work<'_> {
             let place = target.config().section(section).map_or(String::new(), |section| section.place.to_string());
             self.report.line(format_args!(
                 "[{section}] is in printer.cfg already ({place}), and stays as it is. For a second one: {} --name NAME",
-                command(self.args, false)
+                command(&AddArgs { name: None, ..self.args.clone() }, false)
             ));
         } else {
             let sections = self.sections(target, &mcu, wires, address)?;

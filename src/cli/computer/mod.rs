@@ -6,17 +6,18 @@ use std::env;
 use std::ffi::OsString;
 use std::fs;
 use std::io::{self, Read};
+use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Component, Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::thread;
 use std::time::{Duration, Instant};
 
-use glob::{MatchOptions, Pattern};
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::{User, getegid, geteuid, getgroups, getuid};
 
 use pinion_linux::foreign;
-use pinion_printer_config::{Disk, Files};
+use pinion_printer_config::{Disk, Files, NAMES_MAX, is_pattern, matching, names_in};
 use pinion_runtime::klippy::process::Ids;
 
 pub(super) mod board;
@@ -24,6 +25,7 @@ pub(super) mod device;
 pub(super) mod klippy;
 pub(super) mod manager;
 pub(super) mod printer;
+pub(super) mod rights;
 pub(super) mod running;
 pub(super) mod units;
 pub(super) mod uses;
@@ -32,13 +34,6 @@ pub(super) mod uses;
 const TEXT_MAX: u64 = 4 << 20;
 /// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
-/// Highest number of files that a pattern finds. A pattern in klippy's configuration may name every file of the
-/// computer.
-const MATCHES_MAX: usize = 1000;
-/// As in a shell, a pattern finds hidden files only by their dot.
-const LIKE_A_SHELL: MatchOptions =
-    MatchOptions { case_sensitive: true, require_literal_separator: false, require_literal_leading_dot: true };
-
 /// The computer that the program looks at.
 pub(in crate::cli) struct Computer {
     root: PathBuf,
@@ -114,44 +109,15 @@ impl Computer {
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
 
-    /// The names in a folder, in order. Empty if the folder is missing.
-    fn names(&self, folder: &Path) -> Vec<String> {
-        let entries = self.resolve(folder).and_then(fs::read_dir).into_iter().flatten().flatten();
-        let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
-        names.sort();
-        names
-    }
-
     /// The files that an absolute pattern of `*`, `?` and `[...]` finds, in order, as paths for this program. A path
     /// without any of these finds itself, even if the file is missing.
     pub(in crate::cli) fn matching(&self, pattern: impl AsRef<Path>) -> Vec<PathBuf> {
-        let mut paths = vec![PathBuf::from("/")];
-        let mut is_pattern = false;
-        for part in pattern.as_ref().components() {
-            let part = match part {
-                Component::Normal(part) => part.to_string_lossy(),
-                Component::ParentDir => "..".into(),
-                _ => continue,
-            };
-            match Pattern::new(&part).ok().filter(|_| part.contains(['*', '?', '['])) {
-                Some(pattern) => {
-                    is_pattern = true;
-                    let found = paths.iter().flat_map(|folder| {
-                        let names = self.names(folder).into_iter();
-                        names.filter(|name| pattern.matches_with(name, LIKE_A_SHELL)).map(|name| folder.join(name))
-                    });
-                    paths = found.take(MATCHES_MAX).collect();
-                }
-                None => paths.iter_mut().for_each(|path| path.push(&*part)),
-            }
+        let pattern = pattern.as_ref();
+        if !is_pattern(&pattern.to_string_lossy()) {
+            return vec![self.path(pattern)];
         }
-        // The last name itself may be a link.
-        let is_there = |path: &PathBuf| {
-            let folder = self.resolve(path.parent().unwrap_or(Path::new("/")));
-            folder.is_ok_and(|folder| fs::symlink_metadata(folder.join(path.file_name().unwrap_or_default())).is_ok())
-        };
-        paths.retain(|path| !is_pattern || is_there(path));
-        paths.into_iter().map(|path| self.path(path)).collect()
+        let found = matching(self, pattern, &mut { NAMES_MAX }).unwrap_or_default();
+        found.into_iter().map(|path| self.path(path)).collect()
     }
 
     /// The first of these files that exists.
@@ -199,6 +165,12 @@ impl Computer {
             way.extend(steps(&target));
         }
         Ok(self.path(found))
+    }
+
+    /// The same, but a link at the end stays one.
+    pub(in crate::cli) fn unfollowed(&self, path: &Path) -> io::Result<PathBuf> {
+        let folder = self.resolve(path.parent().unwrap_or(path))?;
+        Ok(path.file_name().map_or(folder.clone(), |name| folder.join(name)))
     }
 
     /// Follows symbolic links as the computer itself would. Returns all paths on the way. The last one is no link.
@@ -291,13 +263,14 @@ impl Files for Computer {
         Ok(String::from_utf8_lossy(&foreign::read(&self.resolve(path)?, TEXT_MAX)?).into_owned())
     }
 
-    fn matching(&self, pattern: &Path) -> io::Result<Vec<PathBuf>> {
-        let mut found = Computer::matching(self, pattern);
+    fn names(&self, folder: &Path, most: usize) -> Vec<String> {
+        self.resolve(folder).map(|folder| names_in(&folder, most)).unwrap_or_default()
+    }
+
+    fn is_there(&self, path: &Path) -> bool {
+        let about = self.unfollowed(path).and_then(fs::symlink_metadata);
         // A file in a folder that this user may not search may be there.
-        found.retain(
-            |file| !matches!(fs::symlink_metadata(file), Err(error) if error.kind() == io::ErrorKind::NotFound),
-        );
-        Ok(found.iter().map(|file| self.name(file)).collect())
+        !about.is_err_and(|error| [io::ErrorKind::NotFound, io::ErrorKind::NotADirectory].contains(&error.kind()))
     }
 
     fn whole(&self, path: &Path) -> PathBuf {
@@ -305,26 +278,31 @@ impl Files for Computer {
     }
 }
 
-/// The output of a program. `None` if the program does not end within two seconds.
+/// The first bytes of a program's output. `None` if the program does not end within two seconds.
 pub(in crate::cli) fn output(command: &mut Command) -> Option<String> {
     const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
-    let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
-    let mut child = command.spawn().ok()?;
+    const BYTES_MAX: usize = 4096;
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().ok()?;
     let end = Instant::now() + OUTPUT_TIMEOUT;
-    loop {
-        match child.try_wait() {
-            Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
-            Ok(Some(_)) => break,
-            // It hangs. It is killed, and left alone if it does not end.
-            _ => {
-                let _ = child.kill();
-                return None;
-            }
+    let mut stdout = child.stdout.take()?;
+    let mut bytes = Vec::new();
+    let is_whole = loop {
+        let left = end.saturating_duration_since(Instant::now());
+        let mut chunk = [0; BYTES_MAX];
+        let ready = poll(&mut [PollFd::new(stdout.as_fd(), PollFlags::POLLIN)], PollTimeout::try_from(left).ok()?);
+        match ready {
+            Ok(1..) => match stdout.read(&mut chunk) {
+                Ok(count @ 1..) if bytes.len() < BYTES_MAX => bytes.extend_from_slice(&chunk[..count]),
+                Ok(_) => break true,
+                Err(_) => break false,
+            },
+            Err(Errno::EINTR) => {}
+            _ => break false,
         }
-    }
-    let mut text = String::new();
-    child.stdout.take()?.take(4096).read_to_string(&mut text).ok()?;
-    Some(text)
+    };
+    // It has closed its output, writes too much, or hangs. It is left alone if it does not end.
+    let _ = child.kill();
+    is_whole.then(|| String::from_utf8_lossy(&bytes).into_owned())
 }
 
 #[cfg(test)]
@@ -374,7 +352,7 @@ pub(super) mod tests {
             loop {
                 match Command::new(&path).stdout(Stdio::null()).spawn() {
                     Err(error) if error.kind() == io::ErrorKind::ExecutableFileBusy => {
-                        thread::sleep(Duration::from_millis(1))
+                        std::thread::sleep(Duration::from_millis(1))
                     }
                     Ok(mut child) => {
                         let _ = child.kill();
@@ -420,7 +398,7 @@ pub(super) mod tests {
         assert_eq!(matching("/b/[xz]?.cfg"), ["/b/z1.cfg"]);
         assert_eq!(matching("/*/x.cfg"), ["/a/x.cfg"], "and not one in the other folder");
         assert_eq!(matching("/a/../b/*.bak"), ["/a/../b/y.cfg.bak"]);
-        assert_eq!(matching("/none/*").len() + matching("/a/[").len(), 1);
+        assert_eq!(matching("/none/*").len() + matching("/a/[").len(), 0);
         assert_eq!(matching("/none"), ["/none"]);
         // This takes no time, though there are many ways to try it.
         tree.put(&format!("c/{}", "a".repeat(200)), "");

@@ -3,12 +3,15 @@
 
 use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use pinion_printer_config::pins::{Aliases, Pin};
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::HOST_PATHS;
 
+use super::rights::Rights;
 use super::running::Running;
 use super::{Computer, klippy, units};
 use crate::cli::config;
@@ -53,6 +56,22 @@ pub(in crate::cli) fn configs(computer: &Computer) -> BTreeSet<PathBuf> {
     found.filter(|path| computer.exists(path)).collect()
 }
 
+impl Computer {
+    /// Reads a configuration of klippy's kind with the rights of its owner. It may include any file, and an error quotes
+    /// the file's line.
+    ///
+    /// # Errors
+    ///
+    /// One of the files cannot be read, or klippy would refuse it.
+    pub(in crate::cli) fn config(&self, path: &Path) -> Result<Config, Trouble> {
+        // A link is its owner's choice, so its own owner counts.
+        let about = self.unfollowed(path).and_then(fs::symlink_metadata);
+        let _rights = Rights::of(about.ok().map(|about| (about.uid(), about.gid())))
+            .map_err(|error| Trouble::new(error.to_string()).of(path.display()))?;
+        Config::read_from(self, path)
+    }
+}
+
 impl Printer {
     /// Reads a configuration, with the files that it includes.
     ///
@@ -60,7 +79,7 @@ impl Printer {
     ///
     /// One of the files cannot be read, or klippy would refuse it.
     pub(in crate::cli) fn read(computer: &Computer, path: &Path) -> Result<Printer, Trouble> {
-        let config = Config::read_from(computer, path)?;
+        let config = computer.config(path)?;
         let aliases = Aliases::read(&config).unwrap_or_default();
         Ok(Printer { config, aliases })
     }
@@ -81,6 +100,17 @@ impl Printer {
             let pin = self.aliases.resolve(&Pin::parse(text, true, true).ok()?);
             Some(Named { section, text: text.trim(), pin })
         })
+    }
+
+    /// The MCU of a section: that of its pins, or its `i2c_mcu`.
+    pub(in crate::cli) fn mcu_of(&self, section: &Section) -> String {
+        let named = ["i2c_mcu", "sensor_mcu"].iter().find_map(|key| section.text(key)).map(str::to_owned);
+        named.or_else(|| self.pins_of(section).map(|named| named.pin.chip).next()).unwrap_or_else(|| "mcu".into())
+    }
+
+    /// Whether a section is on one of these MCUs of this computer. 1-Wire is always.
+    pub(in crate::cli) fn is_on(&self, section: &Section, own: &BTreeMap<String, PathBuf>) -> bool {
+        section.text("serial_no").is_some() || own.contains_key(&self.mcu_of(section))
     }
 
     /// The `serial` of an MCU. The main one is called `mcu`.

@@ -18,7 +18,7 @@ use super::computer::Computer;
 use super::computer::board::Board;
 use super::computer::klippy::klippys;
 use super::computer::manager::SYSTEMCTL;
-use super::computer::printer::Printer;
+use super::computer::printer::{Printer, configs};
 use super::computer::uses::Uses;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
@@ -123,7 +123,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
                 uses::no_lines(&uses),
                 uses::slow_buses(computer, &klippys),
                 uses::numpy(computer, &klippys),
-                add::missing(computer, &klippys.iter().filter_map(|klippy| klippy.config.clone()).collect()),
+                add::missing(computer, &configs(computer)),
             ]
             .concat(),
         ),

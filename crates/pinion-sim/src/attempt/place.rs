@@ -99,8 +99,11 @@ mod tests {
         fn text(&self, _: &std::path::Path) -> std::io::Result<String> {
             Ok(self.0.to_owned())
         }
-        fn matching(&self, _: &std::path::Path) -> std::io::Result<Vec<std::path::PathBuf>> {
-            Ok(Vec::new())
+        fn names(&self, _: &std::path::Path, _: usize) -> Vec<String> {
+            Vec::new()
+        }
+        fn is_there(&self, _: &std::path::Path) -> bool {
+            false
         }
         fn whole(&self, path: &std::path::Path) -> std::path::PathBuf {
             Disk.whole(path)

@@ -128,7 +128,7 @@ impl Handshake {
             return Step::Done;
         };
         if self.is_finding
-            && let Some(Found { forms, is_other }) = self.finder.as_ref().and_then(HostFinder::answer)
+            && let Some(Found { forms, is_other }) = self.finder.as_mut().and_then(HostFinder::answer)
         {
             self.is_finding = false;
             surveyor.make(forms);
@@ -160,7 +160,7 @@ impl Handshake {
 
     /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
-        let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
+        let answer = self.finder.as_mut().filter(|_| self.is_overdue).and_then(HostFinder::answer);
         let Some(Found { forms, .. }) = answer else { return };
         self.is_overdue = false;
         if forms != *self.first.forms() {

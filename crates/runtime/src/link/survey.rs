@@ -5,6 +5,7 @@
 
 use std::io;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
 
@@ -81,6 +82,8 @@ pub(crate) fn dialect(firmware: &Firmware, board: &dyn Board, forms: Forms) -> R
 pub(crate) struct Surveyor {
     asks: Sender<Ask>,
     answers: Receiver<Option<Arc<Dialect>>>,
+    /// A look is asked for and has not begun.
+    is_look_due: Arc<AtomicBool>,
     /// Questions that are not answered yet.
     pending: usize,
     found: Option<Arc<Dialect>>,
@@ -98,8 +101,13 @@ impl Surveyor {
         let (replies, answers) = channel();
         let (names, rate) = (Names::of(&firmware, board), firmware.wire.rate());
         let mut maker = Maker { firmware, names, rate, view: board.view(), made: first };
+        let is_look_due = Arc::new(AtomicBool::new(false));
+        let due_look = is_look_due.clone();
         thread::Builder::new().name("survey".into()).spawn(move || {
             for ask in questions {
+                if matches!(ask, Ask::Look) {
+                    due_look.store(false, Ordering::SeqCst);
+                }
                 let sent = replies.send(maker.answer(ask));
                 wake.wake();
                 if sent.is_err() {
@@ -107,12 +115,15 @@ impl Surveyor {
                 }
             }
         })?;
-        Ok(Surveyor { asks, answers, pending: 0, found: None })
+        Ok(Surveyor { asks, answers, is_look_due, pending: 0, found: None })
     }
 
     /// Asks for the board's present devices.
     pub(crate) fn look(&mut self) {
-        self.ask(Ask::Look);
+        // A host may come and go at any rate. A look that has not begun finds whatever is there now.
+        if !self.is_look_due.swap(true, Ordering::SeqCst) {
+            self.ask(Ask::Look);
+        }
     }
 
     /// Asks for the dictionary of these forms.

@@ -4,8 +4,6 @@
 
 use std::path::Path;
 
-use pinion_printer_config::Config;
-
 use super::super::Computer;
 use super::{Resource, Source, Use, Uses};
 
@@ -22,7 +20,7 @@ impl Uses {
 
     /// Adds the services that are configured in this folder.
     pub(super) fn add_services(&mut self, computer: &Computer, folder: &Path) {
-        if let Ok(config) = Config::read_from(computer, &folder.join("moonraker.conf")) {
+        if let Ok(config) = computer.config(&folder.join("moonraker.conf")) {
             let kinds = ["power", "button", "sensor"];
             for section in config.sections().iter().filter(|section| kinds.contains(&section.kind())) {
                 let Some(pin) = section.text("pin") else { continue };
@@ -38,7 +36,7 @@ impl Uses {
                 }
             }
         }
-        if let Ok(config) = Config::read_from(computer, &folder.join("crowsnest.conf")) {
+        if let Ok(config) = computer.config(&folder.join("crowsnest.conf")) {
             for section in config.of_kind("cam") {
                 let Some(device) = section.text("device").filter(|device| device.starts_with("/dev/")) else {
                     continue;

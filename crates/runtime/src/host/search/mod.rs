@@ -108,6 +108,10 @@ pub(crate) struct HostFinder {
     answers: Receiver<(u32, Found)>,
     /// The number of the last question.
     asked: u32,
+    /// The last question waits until the search has answered the one before it. A host may come and go at any rate, and
+    /// the search must not answer all of them before the last one.
+    waits: bool,
+    is_busy: bool,
 }
 
 impl HostFinder {
@@ -143,7 +147,7 @@ impl HostFinder {
             drop(sender);
             wake.wake();
         })?;
-        Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
+        Ok(HostFinder { socket, terminal, board, answers, asked: 0, waits: false, is_busy: false })
     }
 
     /// Asks for the forms of the host that came just now, on the terminal `device`.
@@ -153,21 +157,64 @@ impl HostFinder {
         }
         self.asked = self.asked.wrapping_add(1);
         self.board.found(None);
-        let question = Question { number: self.asked, terminal: self.terminal };
-        // If the search hangs, the link waits as long as for an answer. If the search is gone, it gives no answer.
-        let flags = MsgFlags::MSG_NOSIGNAL | MsgFlags::MSG_DONTWAIT;
-        let _ = send(self.socket.as_raw_fd(), &serde_json::to_vec(&question).unwrap_or_default(), flags);
+        self.waits = true;
+        // The answers to earlier questions are of no use now.
+        let _ = self.answer();
     }
 
     /// The answer to the last question, if it has come.
-    pub(crate) fn answer(&self) -> Option<Found> {
+    pub(crate) fn answer(&mut self) -> Option<Found> {
         loop {
             match self.answers.try_recv() {
-                Ok((number, found)) if number == self.asked => return Some(found),
-                Ok(_) => {}
-                Err(TryRecvError::Empty) => return None,
+                Ok((number, found)) => {
+                    self.is_busy = false;
+                    if number == self.asked {
+                        return Some(found);
+                    }
+                }
+                Err(TryRecvError::Empty) => break,
                 Err(TryRecvError::Disconnected) => return Some(Found::NOTHING),
             }
         }
+        if self.waits && !self.is_busy {
+            let question = Question { number: self.asked, terminal: self.terminal };
+            // If the search hangs, the link waits as long as for an answer. If the search is gone, it gives no answer.
+            let flags = MsgFlags::MSG_NOSIGNAL | MsgFlags::MSG_DONTWAIT;
+            let sent = send(self.socket.as_raw_fd(), &serde_json::to_vec(&question).unwrap_or_default(), flags);
+            (self.waits, self.is_busy) = (false, sent.is_ok());
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_many_hosts_that_come_and_go_only_the_last_one_waits_for_an_answer() {
+        let (socket, search) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::empty()).unwrap();
+        let wake = Arc::new(LinkWake::new().unwrap());
+        let mut finder = HostFinder::start(HostSearch(socket), Path::new("/dev/null"), wake, Arc::default()).unwrap();
+        (0..1000).for_each(|_| finder.ask(None));
+        let mut message = vec![0; MESSAGE_BYTES_MAX];
+        let mut number = || {
+            let question: Question = serde_json::from_slice(receive(&search, &mut message).unwrap()).unwrap();
+            question.number
+        };
+        let answer = |number: u32| {
+            let answer = Answer::new(number, None, true, None, Vec::new());
+            send(search.as_raw_fd(), &serde_json::to_vec(&answer).unwrap(), MsgFlags::empty()).unwrap();
+        };
+        assert_eq!(number(), 1);
+        answer(1);
+        while finder.is_busy && finder.waits {
+            assert!(finder.answer().is_none());
+            thread::yield_now();
+        }
+        assert_eq!(number(), 1000);
+        answer(1000);
+        let found = std::iter::repeat_with(|| finder.answer()).find_map(|found| found).unwrap();
+        assert!(found.is_other, "it is the search's answer");
     }
 }

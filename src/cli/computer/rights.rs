@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The rights with which a user's files are written: the user's own.
+//! The rights with which a user's files are read and written: the user's own.
 
 use std::io;
 
 use nix::unistd::{Gid, Uid, getegid, geteuid, getgroups, setegid, seteuid, setgroups};
 
 /// The rights of a file's owner, for as long as this exists. Without root's rights it changes nothing.
-pub(super) struct Rights(Option<(Uid, Gid, Vec<Gid>)>);
+pub(in crate::cli) struct Rights(Option<(Uid, Gid, Vec<Gid>)>);
 
 impl Rights {
-    pub(super) fn of(owner: Option<(u32, u32)>) -> io::Result<Rights> {
+    pub(in crate::cli) fn of(owner: Option<(u32, u32)>) -> io::Result<Rights> {
         let Some((uid, gid)) = owner.filter(|(uid, _)| *uid != 0 && geteuid().is_root()) else {
             return Ok(Rights(None));
         };
