@@ -32,7 +32,8 @@ host = {"state": "standby", "sections": [], "answers": []}
 
 def sections(path):
     for line in open(path):
-        name = line.strip().strip("[]")
+        # Behind a section may be a comment.
+        name = line.split("]")[0].strip("[ \n")
         if line.startswith("[include "):
             for path_ in sorted(glob.glob(os.path.join(os.path.dirname(path), name.split()[1]))):
                 yield from sections(path_)
