@@ -139,7 +139,8 @@ impl Looker {
         self.is_other = false;
         let search = find(Path::new(PROC), terminal);
         match &search {
-            Ok(Search::Found(process)) => self.meet(process),
+            // Each connection has its own `pinion attach`, and one klippy on another computer.
+            Ok(Search::Found(process)) if !process.is_attach() => self.meet(process),
             _ => self.missed_one = true,
         }
         let say = &mut self.say;
