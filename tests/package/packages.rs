@@ -48,7 +48,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
     )?;
     // The files for `make install`, with the program that is already built.
     process::pipeline(
-        r#"cd "$1"; tar -c Makefile systemd udev man | tar -x -C "$2" --one-top-level=tree
+        r#"cd "$1"; tar -c Makefile systemd udev man docs/guide | tar -x -C "$2" --one-top-level=tree
            install -D -t "$2/tree/target/release" "$2/pinion" "$2/pinion-sim""#,
         &[&tree.display().to_string(), &folder.display().to_string()],
     )
