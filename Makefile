@@ -278,6 +278,7 @@ ifeq ($(DESTDIR),)
 	done
 endif
 	rm -rf $(DESTDIR)$(DOCDIR)/guide
+	-rmdir --ignore-fail-on-non-empty $(DESTDIR)$(DOCDIR)
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(PREFIX)/bin/pinion-sim $(DESTDIR)$(MANDIR)/man1/pinion-sim.1 \
 	    $(DESTDIR)$(BASHDIR)/pinion-sim $(DESTDIR)$(ZSHDIR)/_pinion-sim $(DESTDIR)$(FISHDIR)/pinion-sim.fish \
 	    $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
