@@ -73,6 +73,11 @@ pub(super) fn undo(
     if computer.is_this() && !boot.is_empty() && !geteuid().is_root() {
         return Err(format!("some of these files are root's: {}", command(args, true)));
     }
+    // Neither side changes before the other one can.
+    root.probe(boot.iter().map(|edit| edit.file.clone()))?;
+    if let Some((side, _)) = &host {
+        side.probe(own.iter().map(|edit| edit.file.clone()))?;
+    }
     if !own.is_empty() || !boot.is_empty() {
         ask(args, computer, moonraker.as_deref(), report, "Take this back?")?;
     }
@@ -118,9 +123,8 @@ impl Needs<'_> {
         let mut edits = Vec::new();
         let own = self.device.file(self.name);
         let Some(board) = &self.uses.board else { return Ok(edits) };
-        let files: Vec<&str> = board.files.iter().map(String::as_str).collect();
         side.sweep(Path::new(MODULES));
-        if let Some(file) = side.computer.first(&files).map(Path::new) {
+        if let Some(file) = board.file(side.computer).map(Path::new) {
             side.sweep(file);
             let old = side.read(file)?.unwrap_or_default();
             let mut new = old.clone();

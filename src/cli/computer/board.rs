@@ -100,6 +100,19 @@ pub(in crate::cli) struct Board {
     pub(in crate::cli) pwm: BTreeMap<String, u32>,
     /// The functions on the header.
     pub(in crate::cli) bus: BTreeMap<Kind, Bus>,
+    /// The clock from which the processor makes that of SPI, if it changes.
+    pub(in crate::cli) clock: Option<Clock>,
+}
+
+/// The VPU's clock of some Raspberry Pis.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::cli) struct Clock {
+    /// The sections of config.txt that apply to the processors with this clock.
+    pub(in crate::cli) sections: Vec<String>,
+    /// `core_freq` and `core_freq_min`, if config.txt does not set them.
+    pub(in crate::cli) usual_mhz: u32,
+    pub(in crate::cli) slowest_mhz: u32,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -226,6 +239,11 @@ impl Board {
         is_marked && self.models.iter().any(|name| name == model)
     }
 
+    /// The file with the boot loader's settings.
+    pub(in crate::cli) fn file(&self, computer: &Computer) -> Option<&str> {
+        self.files.iter().map(String::as_str).find(|file| computer.exists(file))
+    }
+
     /// The line of a pin, as printer.cfg writes it.
     pub(in crate::cli) fn line(&self, pin: usize) -> Option<&str> {
         self.lines.get(&pin.to_string()).map(String::as_str)
@@ -242,14 +260,20 @@ impl Board {
     }
 }
 
-/// The device tree's model.
+/// The device tree's model, or the board that the user has named.
 pub(in crate::cli) fn model(computer: &Computer) -> String {
-    computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
+    let model = computer.text("/proc/device-tree/model").map(|model| model.trim_end_matches('\0').to_owned());
+    model.or_else(|| computer.board.clone()).unwrap_or_default()
 }
 
 /// Whether this is a Raspberry Pi.
 pub(in crate::cli) fn is_pi(computer: &Computer) -> bool {
     model(computer).contains("Raspberry Pi")
+}
+
+/// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
+pub(in crate::cli) fn is_pi5(computer: &Computer) -> bool {
+    ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model(computer).starts_with(name))
 }
 
 /// A Raspberry Pi's config.txt.

@@ -20,6 +20,8 @@ use pinion_linux::foreign;
 use pinion_printer_config::{Disk, Files, NAMES_MAX, is_pattern, matching, names_in};
 use pinion_runtime::klippy::process::Ids;
 
+use board::Board;
+
 pub(super) mod board;
 pub(super) mod device;
 pub(super) mod klippy;
@@ -39,6 +41,8 @@ pub(in crate::cli) struct Computer {
     root: PathBuf,
     /// The user that has called this program.
     caller: Option<u32>,
+    /// The name of its board. A mounted card has no device tree that says so.
+    board: Option<String>,
 }
 
 /// A user, with all groups.
@@ -79,7 +83,28 @@ impl Computer {
         let behind_root = || env::var("SUDO_UID").ok()?.parse().ok();
         let user = getuid();
         let caller = if user.is_root() { behind_root() } else { Some(user.as_raw()) };
-        Computer { root: root.to_owned(), caller }
+        Computer { root: root.to_owned(), caller, board: None }
+    }
+
+    /// The computer whose files are below a folder that the user names, and its board. `/.` is this computer.
+    ///
+    /// # Errors
+    ///
+    /// One line: there is no such folder, or no board has this name.
+    pub(in crate::cli) fn named(root: &Path, board: Option<&str>) -> Result<(Computer, Option<Board>), String> {
+        // Changes are made below the folder's descriptor, and a path relative to it would mean another one.
+        let mut computer = match fs::canonicalize(root) {
+            Ok(root) if root.is_dir() => Computer::at(&root),
+            _ => {
+                return Err(format!(
+                    "{}: there is no such folder: name the one where the system's files are, such as /mnt",
+                    root.display()
+                ));
+            }
+        };
+        let board = Board::of(&computer, board)?;
+        computer.board = board.as_ref().map(|board| board.name.clone());
+        Ok((computer, board))
     }
 
     /// True for the live system (root is `/`). Its kernel knows more than its files.
@@ -320,7 +345,7 @@ pub(super) mod tests {
         }
 
         pub(in crate::cli) fn computer(&self) -> Computer {
-            Computer { root: self.0.path().to_owned(), caller: None }
+            Computer { root: self.0.path().to_owned(), caller: None, board: None }
         }
 
         /// The same for a program that this user has called.
@@ -380,6 +405,14 @@ pub(super) mod tests {
             self.put(&format!("proc/{pid}/status"), &status);
             self.put(&format!("proc/{pid}/exe"), "");
         }
+    }
+
+    #[test]
+    fn a_longer_path_of_the_root_folder_is_this_computer() {
+        for root in ["/", "/.", "/proc/.."] {
+            assert!(Computer::named(Path::new(root), None).unwrap().0.is_this(), "{root}");
+        }
+        assert!(Computer::named(Path::new("/nonexistent"), None).is_err());
     }
 
     #[test]
