@@ -8,17 +8,42 @@ use std::collections::BTreeMap;
 
 use pinion_linux::foreign::word;
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 use super::Computer;
 
+/// Files of the program, by their names without the ending.
 macro_rules! files {
-    ($($name:literal)*) => {
-        [$(($name, include_str!(concat!("boards/", $name, ".toml")))),*]
+    ($folder:literal: $($name:literal)*) => {
+        [$(($name, include_str!(concat!($folder, "/", $name, ".toml")))),*]
     };
+}
+pub(in crate::cli) use files;
+
+/// The names of such files.
+pub(in crate::cli) const fn names<const COUNT: usize>(
+    files: &[(&'static str, &'static str); COUNT],
+) -> [&'static str; COUNT] {
+    let mut names = [""; COUNT];
+    let mut at = 0;
+    while at < COUNT {
+        names[at] = files[at].0;
+        at += 1;
+    }
+    names
+}
+
+/// Reads such a file.
+///
+/// # Errors
+///
+/// Its mistake. The tests find it before a user does.
+pub(in crate::cli) fn parse<T: DeserializeOwned>(name: &str, text: &str) -> Result<T, String> {
+    toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {name}.toml: {error}"))
 }
 
 /// Each board by its name on the command line. The first one that fits counts.
-const BOARDS: [(&str, &str); 9] = files!("raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
+const BOARDS: [(&str, &str); 9] = files!("boards": "raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
     "orange-pi-3-lts" "orange-pi-zero-2" "radxa-zero-3");
 
 /// A kind of connection.
@@ -192,24 +217,12 @@ pub(in crate::cli) fn function(node: &str) -> String {
 ///
 /// The first file with a mistake. The tests find it before a user does.
 pub(in crate::cli) fn all() -> Result<Vec<Board>, String> {
-    let board = |(id, text): (&'static str, &str)| {
-        let board: Board =
-            toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {id}.toml: {error}"))?;
-        Ok(Board { id, ..board })
-    };
+    let board = |(id, text): (&'static str, &str)| Ok(Board { id, ..parse(id, text)? });
     BOARDS.into_iter().map(board).collect()
 }
 
 /// The names of the boards on the command line.
-pub(in crate::cli) const NAMES: [&str; 9] = {
-    let mut names = [""; 9];
-    let mut at = 0;
-    while at < names.len() {
-        names[at] = BOARDS[at].0;
-        at += 1;
-    }
-    names
-};
+pub(in crate::cli) const NAMES: [&str; BOARDS.len()] = names(&BOARDS);
 
 impl Board {
     /// The board that this computer is, or the one that has this name.

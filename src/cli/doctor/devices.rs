@@ -15,8 +15,8 @@ use crate::cli::settings::BoardName;
 use pinion_linux::foreign::word;
 use pinion_linux::gpio::{FastGpio, LINK_REMEDY, never_sleeps};
 
-use super::instance::Instance;
 use super::{INSTALL, REINSTALL};
+use crate::cli::computer::instance::Instance;
 
 /// A kind of devices.
 pub(super) struct Class {
@@ -31,66 +31,35 @@ pub(super) struct Class {
     pub(super) nodes: &'static str,
 }
 
-const CLASSES: [Class; 6] = [
-    Class {
-        check: "gpio",
-        name: "GPIO",
-        access: Access::READ_WRITE,
-        subsystem: "gpio",
-        enabled_by: None,
-        nodes: "/dev/gpiochip*",
-    },
-    Class {
-        check: "adc",
-        name: "ADC",
-        access: Access::READ,
-        subsystem: "iio",
-        enabled_by: None,
-        nodes: "/sys/bus/iio/devices/iio:device*/in_voltage*_raw",
-    },
-    Class {
-        check: "pwm",
-        name: "PWM",
-        access: Access::WRITE,
-        subsystem: "pwm",
-        enabled_by: Some(("dtoverlay=pwm-2chan", "pwm")),
-        nodes: "/sys/class/pwm/pwmchip*/export",
-    },
-    Class {
-        check: "spi",
-        name: "SPI",
-        access: Access::READ_WRITE,
-        subsystem: "spidev",
-        enabled_by: Some(("dtparam=spi=on", "spi")),
-        nodes: "/dev/spidev*",
-    },
-    Class {
-        check: "i2c",
-        name: "I2C",
-        access: Access::READ_WRITE,
-        subsystem: "i2c-dev",
-        enabled_by: Some(("dtparam=i2c_arm=on", "i2c")),
-        nodes: "/dev/i2c-*",
-    },
-    Class {
-        check: "w1",
-        name: "1-Wire",
-        access: Access::READ,
-        subsystem: "w1",
-        enabled_by: Some(("dtoverlay=w1-gpio", "w1-gpio")),
-        nodes: "/sys/bus/w1/devices/28-*/w1_slave",
-    },
-];
+impl Class {
+    const fn new(
+        (check, name): (&'static str, &'static str),
+        access: Access,
+        subsystem: &'static str,
+        nodes: &'static str,
+        enabled_by: Option<(&'static str, &'static str)>,
+    ) -> Class {
+        Class { check, name, access, subsystem, enabled_by, nodes }
+    }
+}
 
+const ADC: &str = "/sys/bus/iio/devices/iio:device*/in_voltage*_raw";
+const PWM: &str = "/sys/class/pwm/pwmchip*/export";
+const W1: &str = "/sys/bus/w1/devices/28-*/w1_slave";
+
+const CLASSES: [Class; 6] = [
+    Class::new(("gpio", "GPIO"), Access::READ_WRITE, "gpio", "/dev/gpiochip*", None),
+    Class::new(("adc", "ADC"), Access::READ, "iio", ADC, None),
+    Class::new(("pwm", "PWM"), Access::WRITE, "pwm", PWM, Some(("dtoverlay=pwm-2chan", "pwm"))),
+    Class::new(("spi", "SPI"), Access::READ_WRITE, "spidev", "/dev/spidev*", Some(("dtparam=spi=on", "spi"))),
+    Class::new(("i2c", "I2C"), Access::READ_WRITE, "i2c-dev", "/dev/i2c-*", Some(("dtparam=i2c_arm=on", "i2c"))),
+    Class::new(("w1", "1-Wire"), Access::READ, "w1", W1, Some(("dtoverlay=w1-gpio", "w1-gpio"))),
+];
 /// The registers of GPIO chips.
-pub(super) const FAST: Class = Class {
-    check: "fast_gpio",
-    name: "fast lines",
-    access: Access::READ_WRITE,
-    subsystem: "*gpiomem*",
-    enabled_by: None,
-    nodes: "/dev/gpiomem*",
-};
+pub(super) const FAST: Class =
+    Class::new(("fast_gpio", "fast lines"), Access::READ_WRITE, "*gpiomem*", "/dev/gpiomem*", None);
+const SERIAL: Class = Class::new(("serial", "serial port"), Access::READ_WRITE, "tty", "/dev", None);
+const WATCHDOG: Class = Class::new(("watchdog", "watchdog"), Access::WRITE, "misc", "/dev/watchdog", None);
 
 /// The kernel's policy for the sleep of PCIe links.
 const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
@@ -125,14 +94,6 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     };
     let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
-    const SERIAL: Class = Class {
-        check: "serial",
-        name: "serial port",
-        access: Access::READ_WRITE,
-        subsystem: "tty",
-        enabled_by: None,
-        nodes: "/dev",
-    };
     let there = ports.iter().filter_map(|name| match computer.port(name) {
         Port::There(port) => Some(computer.path(format!("/dev/{port}"))),
         Port::Missing | Port::Other => None,
@@ -140,14 +101,6 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     let ports: Vec<PathBuf> = there.collect();
     findings.extend(self::permission(computer, user, &anew, &SERIAL, &ports));
     if instances.iter().any(|instance| instance.settings.watchdog) {
-        const WATCHDOG: Class = Class {
-            check: "watchdog",
-            name: "watchdog",
-            access: Access::WRITE,
-            subsystem: "misc",
-            enabled_by: None,
-            nodes: "/dev/watchdog",
-        };
         findings.extend(permission(&WATCHDOG));
     }
     let wants = |wish| instances.iter().any(|instance| instance.settings.fast_gpio == wish);
@@ -272,10 +225,10 @@ pub(super) fn is_rp1(computer: &Computer) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
     use crate::cli::boards;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use std::os::unix::fs::MetadataExt;

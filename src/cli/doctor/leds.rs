@@ -9,11 +9,10 @@ use crate::cli::computer::Computer;
 use crate::cli::computer::board::{self, Clock, Kind, append, pi_config};
 use crate::cli::computer::uses::boot::ConfigTxt;
 use crate::cli::finding::Finding;
-use crate::cli::settings::BoardName;
 use pinion_linux::gpio::FastGpio;
 
 use super::devices::{FAST, is_rp1};
-use super::instance::Instance;
+use crate::cli::computer::instance::Instance;
 
 const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
 
@@ -61,10 +60,7 @@ pub(super) fn line_leds(
     instances: &[Instance],
     pins: &BTreeSet<(PathBuf, String)>,
 ) -> Vec<Finding> {
-    let own = |link: &Path| {
-        let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-        own.find(|instance| instance.link.as_deref() == Some(link))
-    };
+    let own = |link: &Path| instances.iter().find(|instance| instance.serves(link));
     let pins = pins.iter().filter_map(|(link, pin)| Some((own(link)?, pin)));
     pins.map(|(instance, pin)| line_led(computer, instance, pin)).collect()
 }
@@ -101,9 +97,9 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
 

@@ -2,23 +2,20 @@
 //! GPIO lines: which ones the pins of a printer.cfg mean.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::is_pi;
 use crate::cli::computer::printer::line_of;
 use crate::cli::finding::Finding;
-use crate::cli::settings::BoardName;
 use pinion_linux::Inventory;
 use pinion_linux::pins::{Names, line_number};
 
-use super::instance::Instance;
+use crate::cli::computer::instance::Instance;
 
 /// The pins whose MCU is one of these instances, and has this computer's lines.
 pub(super) fn of_instances<'a>(instances: &[Instance], pins: &'a BTreeSet<(PathBuf, String)>) -> BTreeSet<&'a str> {
-    let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-    let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
-    pins.iter().filter(|(link, _)| links.contains(&link.as_path())).map(|(_, pin)| pin.as_str()).collect()
+    pins.iter().filter(|(link, _)| instances.iter().any(|one| one.serves(link))).map(|(_, pin)| pin.as_str()).collect()
 }
 
 /// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
@@ -80,12 +77,13 @@ pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
     use crate::cli::boards::{self, TestBoard};
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Ok as Fine, Warning};
+    use std::path::Path;
 
     /// The findings about the header of a board, with these pins in printer.cfg.
     fn about_header(board: &TestBoard, pins: &[&str]) -> Vec<Finding> {

@@ -17,6 +17,7 @@ use super::add;
 use super::complete::offering;
 use super::computer::Computer;
 use super::computer::board::{self, Board};
+use super::computer::instance;
 use super::computer::klippy::klippys;
 use super::computer::manager::SYSTEMCTL;
 use super::computer::printer::Printer;
@@ -27,7 +28,6 @@ use super::{failed, quietly};
 
 mod devices;
 mod host;
-mod instance;
 mod kernel;
 mod klipper;
 mod last_stop;
@@ -157,7 +157,7 @@ fn latency(sample: Result<Assessment, String>) -> Finding {
 }
 
 #[cfg(test)]
-mod tests {
+pub(in crate::cli) mod tests {
     use super::super::computer::tests::Tree;
     use super::super::finding::Level;
     use super::*;
@@ -165,7 +165,7 @@ mod tests {
 
     /// Asserts that a check has found something with these words, and returns the remedy.
     #[track_caller]
-    pub(super) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
+    pub(in crate::cli) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
             finding.check == check && finding.status == status && finding.trouble.found().contains(words)
         };

@@ -52,6 +52,19 @@ pub(in crate::cli) enum Resource {
     Unknown(String),
 }
 
+impl Resource {
+    /// The function of a board that has it, as [`board::function`] names it.
+    pub(in crate::cli) fn function(&self) -> Option<String> {
+        match self {
+            Resource::Select(bus, _) | Resource::Controller(bus) => Some(format!("spi{bus}")),
+            Resource::I2c(bus, _) => Some(format!("i2c{bus}")),
+            Resource::Sensor(_) => Some("w1".to_owned()),
+            Resource::Pwm(name) | Resource::Port(name) => Some(board::function(name)),
+            Resource::Line(_) | Resource::Device(_) | Resource::Unknown(_) => None,
+        }
+    }
+}
+
 impl std::fmt::Display for Resource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
