@@ -4,7 +4,7 @@
 use std::ffi::OsString;
 use std::fs::Metadata;
 use std::os::unix::fs::FileTypeExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueHint};
@@ -174,6 +174,16 @@ pub fn with_simulator(simulator: clap::Command) -> clap::Command {
         let about = own.get_about().cloned().unwrap_or_default();
         simulator.name("sim").about(about)
     })
+}
+
+/// The checkout of the only klippy that this computer has.
+pub fn klipper_here() -> Option<PathBuf> {
+    let klippys = computer::klippy::klippys(&computer::Computer::at(Path::new("/"))).into_iter();
+    // What a process sees below its own root is not here.
+    let folders = klippys.filter_map(|klippy| klippy.folder).filter(|folder| !folder.starts_with("/proc"));
+    let mut folders: Vec<PathBuf> = folders.filter_map(|folder| Some(folder.parent()?.to_owned())).collect();
+    folders.dedup();
+    if folders.len() == 1 { folders.pop() } else { None }
 }
 
 /// Prints the script for a shell.

@@ -9,12 +9,14 @@ use std::path::{Path, PathBuf};
 use nix::unistd::geteuid;
 use pinion_linux::foreign::plain;
 use pinion_linux::own_folder::OwnFolder;
-use pinion_printer_config::Trouble;
+use pinion_printer_config::{Config, Section, Trouble};
 use toml::Table;
 
 use super::args::OwnArgs;
+use super::klippy::Klippy;
 use super::known::lacks_module;
 use super::serve::{Folder, Own, section_of};
+use super::translate::check;
 use crate::description::text;
 
 /// Whether a file is klippy's configuration, and no description.
@@ -29,9 +31,25 @@ pub(crate) fn is_printer_cfg(path: &Path) -> bool {
 /// It is no printer, or has a mistake.
 pub(crate) fn read(path: &Path, args: &OwnArgs) -> Result<Own, Trouble> {
     let over = args.with.as_deref().map(table).transpose()?;
-    let own = Own::read(path, args.built_like.as_deref(), over, args.pace())?;
+    let klippy = Klippy::of(args);
+    let own = Own::read(path, args.built_like.as_deref(), over, args.pace(), klippy.is_none())?;
+    if let Some(klippy) = klippy
+        && !klippy.judge(&own, &left_out(&own.config, args))?
+    {
+        check(&own.config)?;
+    }
     own.notes.iter().for_each(|note| log::warn!("{note}"));
     Ok(own)
+}
+
+/// The sections that klippy's copy is without.
+fn left_out<'a>(config: &'a Config, args: &OwnArgs) -> Vec<&'a str> {
+    if !args.without_plugins {
+        return Vec::new();
+    }
+    let klipper = args.klipper();
+    let is_out = |section: &&Section| lacks_module(section.kind(), klipper.as_deref());
+    config.sections().iter().filter(is_out).map(|section| section.name.as_str()).collect()
 }
 
 /// A description that lies over another one.
@@ -63,11 +81,7 @@ impl Place {
             let trouble = Trouble::new("there is no klippy/klippy.py in it").of(klipper.display());
             return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper"));
         }
-        let sections = own.config.sections().iter();
-        let left_out: Vec<&str> = sections
-            .filter(|section| args.without_plugins && lacks_module(section.kind(), args.klipper().as_deref()))
-            .map(|section| section.name.as_str())
-            .collect();
+        let left_out = left_out(&own.config, args);
         if !left_out.is_empty() {
             log::info!("klippy's copy is without [{}]", left_out.join("], ["));
         }

@@ -16,7 +16,7 @@ use pinion_printer_config::{Config, Section, Trouble};
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
-use super::translate::{Pace, Pins, Translated, translate};
+use super::translate::{Pace, Pins, Translated, check, translate};
 use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
@@ -39,7 +39,7 @@ pub(crate) struct Own {
 
 impl Own {
     /// Reads a printer.cfg. `built_like` is the printer.cfg of the printer, if it is another one. `over` is a description
-    /// that lies over the one that comes out of it.
+    /// that lies over the one that comes out of it. `is_checked`: no klippy is asked later.
     ///
     /// # Errors
     ///
@@ -49,11 +49,12 @@ impl Own {
         built_like: Option<&Path>,
         over: Option<Table>,
         pace: Pace,
+        is_checked: bool,
     ) -> Result<Own, Trouble> {
-        let (config, translated) = read(path, pace)?;
+        let (config, translated) = read(path, pace, is_checked)?;
         let Translated { mut description, mcus, pins, notes } = translated;
         if let Some(built_like) = built_like {
-            let (_, built) = read(built_like, pace)?;
+            let (_, built) = read(built_like, pace, true)?;
             if built.mcus != mcus {
                 let cause = format!("it has the MCUs {}, and {} has others", built.mcus.join(", "), path.display());
                 return Err(Trouble::new(cause).of(built_like.display()).remedy("name a printer.cfg of this printer"));
@@ -70,9 +71,12 @@ impl Own {
     }
 }
 
-fn read(path: &Path, pace: Pace) -> Result<(Config, Translated), Trouble> {
+fn read(path: &Path, pace: Pace, is_checked: bool) -> Result<(Config, Translated), Trouble> {
     let mut config = Config::read(path)?;
     config.put_constants_in();
+    if is_checked {
+        check(&config)?;
+    }
     let translated = translate(&config, pace)?;
     Ok((config, translated))
 }
@@ -189,7 +193,10 @@ impl Folder {
             with: vec![(key.into(), value.display().to_string())],
             ..Change::default()
         };
-        changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        // Without the option, klippy refuses the section, and so it does the copy.
+        if own.config.section("virtual_sdcard").is_some_and(|section| section.text("path").is_some()) {
+            changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        }
         let is_of_host = |section: &&Section| section.text("sensor_type") == Some("temperature_host");
         let of_host: Vec<&Section> = own.config.sections().iter().filter(is_of_host).collect();
         if !of_host.is_empty() {
@@ -198,7 +205,8 @@ impl Folder {
             fs::write(&millidegrees, HOST_TEMPERATURE).map_err(|error| failed(&millidegrees, error))?;
             changes.extend(of_host.iter().map(|section| elsewhere(&section.name, "sensor_path", &millidegrees)));
         }
-        if let Some(section) = own.config.section("save_variables") {
+        if let Some(section) = own.config.section("save_variables").filter(|section| section.text("filename").is_some())
+        {
             let variables = path.join("variables.cfg");
             let file = section.text("filename").map(at_home);
             if let Some(file) = file
@@ -208,6 +216,13 @@ impl Folder {
             }
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
+        // That phase is the real endstop's. The simulated one has another.
+        let phases = own.config.of_kind("endstop_phase").map(|section| Change {
+            section: section.name.clone(),
+            without: vec!["trigger_phase".into()],
+            ..Change::default()
+        });
+        changes.extend(phases);
         changes.extend(left_out.iter().map(|section| Change {
             section: (*section).to_owned(),
             left_out: true,

@@ -41,6 +41,16 @@ pub(crate) struct Translated {
     pub(crate) notes: Vec<Trouble>,
 }
 
+/// Checks a configuration where no klippy can be asked.
+///
+/// # Errors
+///
+/// The first mistake that klippy refuses, too.
+pub(super) fn check(config: &Config) -> Result<(), Trouble> {
+    rules::check(config)?;
+    claims::check(config, &Aliases::read(config)?, &mcus(config)?)
+}
+
 /// Translates a configuration.
 ///
 /// # Errors
@@ -48,8 +58,6 @@ pub(crate) struct Translated {
 /// The first thing that klippy refuses, too, and without which there is no printer.
 pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Trouble> {
     let (aliases, mcus) = (Aliases::read(config)?, mcus(config)?);
-    rules::check(config)?;
-    claims::check(config, &aliases, &mcus)?;
     let mut translator = Translator {
         config,
         aliases,
@@ -78,6 +86,10 @@ pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Troub
 fn mcus(config: &Config) -> Result<Vec<String>, Trouble> {
     if config.section(MAIN).is_none() {
         return Err(Trouble::new("Option 'serial' in section 'mcu' must be specified").remedy("add [mcu]"));
+    }
+    // klippy's copy has other ways to the MCUs, so klippy does not miss these.
+    for section in config.of_kind(MAIN).filter(|section| section.text("canbus_uuid").is_none()) {
+        section.required("serial")?;
     }
     let others = config.of_kind(MAIN).filter_map(Section::own_name).map(str::to_owned);
     let mcus: Vec<String> = std::iter::once(MAIN.to_owned()).chain(others).collect();
@@ -159,6 +171,12 @@ impl Translator<'_> {
         Some(pin.to_string())
     }
 
+    /// The section that has taken the pin of an option.
+    pub(super) fn owner(&self, section: &Section, key: &str) -> Result<Option<&str>, Trouble> {
+        let place = self.pin(section, key)?.map(|pin| (pin.chip, pin.name));
+        Ok(place.and_then(|place| self.taken.get(&place)).map(String::as_str))
+    }
+
     /// Takes a pin that several motors may share.
     pub(super) fn take_enable(&mut self, section: &Section, key: &str) -> Result<Option<String>, Trouble> {
         let Some(pin) = self.pin(section, key)? else { return Ok(None) };
@@ -201,8 +219,10 @@ impl Translator<'_> {
     /// The I2C bus of a chip.
     pub(super) fn i2c(&mut self, section: &Section) -> Result<String, Trouble> {
         let mcu = section.text("i2c_mcu").unwrap_or(MAIN).to_owned();
-        if section.text("i2c_software_scl_pin").is_some() {
-            let [scl, sda] = ["i2c_software_scl_pin", "i2c_software_sda_pin"].map(|key| self.pin(section, key));
+        // The MCP4018 had other names for its lines until v0.13.
+        let lines = [["i2c_software_scl_pin", "i2c_software_sda_pin"], ["scl_pin", "sda_pin"]];
+        if let Some(keys) = lines.into_iter().find(|[scl, _]| section.text(scl).is_some()) {
+            let [scl, sda] = keys.map(|key| self.pin(section, key));
             let [scl, sda] = [scl?, sda?].map(|pin| pin.map(|pin| Translator::on(&mcu, &pin.name)));
             return Ok(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)]));
         }
