@@ -130,12 +130,8 @@ fn a_klippy_that_is_there_judges_the_printer_cfg() {
     let cfg = home.path().join("printer.cfg");
     let read = |text: &str| {
         fs::write(&cfg, text).unwrap();
-        // klippy never runs as root.
-        let mut pinion = Command::new(if here::is_root() { "setpriv" } else { "env" });
-        if here::is_root() {
-            pinion.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
-        }
-        pinion.arg(pinion_path()).arg("sim").arg(&cfg).args(["--print-board", "--klipper"]).arg(&checkout);
+        let mut pinion = as_a_user();
+        pinion.arg("sim").arg(&cfg).args(["--print-board", "--klipper"]).arg(&checkout);
         let done = pinion.args(["--python", &python()]).output().unwrap();
         (done.status.success(), String::from_utf8(done.stderr).unwrap())
     };
@@ -154,6 +150,56 @@ fn a_klippy_that_is_there_judges_the_printer_cfg() {
     }
     // These words name nothing of the file.
     assert!(without_line.len() <= 2, "{without_line:#?}");
+}
+
+/// What klippy takes, and Pinion once refused, or left klippy without.
+#[test]
+fn what_klippy_takes_is_served() {
+    let Some(checkout) = checkout("what_klippy_takes_is_served") else { return };
+    let home = tempfile::tempdir().unwrap();
+    fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
+    let probe = "[probe]\npin: ^tool:gpio9\nx_offset: 20\nz_offset: 1.5\n";
+    let with = |more: &str| format!("{PRINTER}\n{more}");
+    let chip = |name: &str| format!("[temperature_sensor {name}]\nsensor_type: BME280\ni2c_bus: i2c1\n");
+    for (name, text) in [
+        ("aht", with("[temperature_sensor a]\nsensor_type: AHT10\ni2c_bus: i2c1\n")),
+        ("two sections for one chip", with(&[chip("a"), chip("b")].concat())),
+        ("Klipper's own", with("[query_adc]\n[print_stats]\n[heaters]\n[statistics]\n")),
+        ("a plugin's probe", PRINTER.replace(probe, "[beacon]\nserial: /dev/x\nx_offset: 20\n")),
+        (
+            "a plugin's steppers",
+            with(
+                "[mmu_machine]\n[stepper_mmu_gear]\nstep_pin: PD0\ndir_pin: PD1\nrotation_distance: 22\nmicrosteps: 16\n\
+                 [tmc2209 stepper_mmu_gear]\nuart_pin: PD4\nrun_current: 0.5\n",
+            ),
+        ),
+        (
+            "a plugin's command",
+            with("[zcalib]\n[gcode_macro ZCALIB]\nrename_existing: OLD_ZCALIB\ngcode: OLD_ZCALIB\n"),
+        ),
+        ("a plugin's sensor", with("[tca9548a a]\n[temperature_sensor b]\nsensor_type: AHT2X_TCA9548A\n")),
+    ] {
+        let cfg = home.path().join("printer.cfg");
+        fs::write(&cfg, &text).unwrap();
+        let mut pinion = as_a_user();
+        pinion.arg("sim").arg(&cfg).args(["--print-board", "--without-plugins", "--klipper"]).arg(&checkout);
+        let done = pinion.args(["--python", &python()]).output().unwrap();
+        let log = String::from_utf8(done.stderr).unwrap();
+        if log.contains("cannot be asked") {
+            return here::not_run("klippy's Python or its checkout may not be read by the user nobody");
+        }
+        assert!(done.status.success(), "{name}: {log}");
+    }
+}
+
+/// `pinion`, as nobody if the tests run as root: klippy never runs as root.
+fn as_a_user() -> Command {
+    if !here::is_root() {
+        return Command::new(pinion_path());
+    }
+    let mut command = Command::new("setpriv");
+    command.args(["--reuid=65534", "--regid=65534", "--clear-groups"]).arg(pinion_path());
+    command
 }
 
 /// Changes that klippy takes and that do not fit the printer: the step that fails, and a part of its text.

@@ -5,6 +5,7 @@ use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
 use super::known::is_left_over;
+use super::plugins::{PIN, StandIn};
 use super::translate::Translator;
 
 /// How high a coil is above the nozzle's tip.
@@ -54,11 +55,26 @@ impl Translator<'_> {
         for section in self.config.sections() {
             self.device(section)?;
         }
+        self.stand_in();
         Ok(())
+    }
+
+    /// The plain probe in the place of a plugin's.
+    fn stand_in(&mut self) {
+        let Some(StandIn { section, offsets_mm }) = self.left_out.stand_in.clone() else { return };
+        let mut part = Entry::default().set("kind", "probe").set("pin", PIN);
+        for (axis, mm) in ["x", "y", "z"].iter().zip(offsets_mm) {
+            part = part.set(&format!("{axis}_offset_mm"), mm);
+        }
+        self.out.add("part", part);
+        if let Some(section) = self.config.section(&section) {
+            self.note(section, "is left out", "a plain [probe] at its offsets takes its place");
+        }
     }
 
     fn device(&mut self, section: &Section) -> Result<(), Trouble> {
         match section.kind() {
+            _ if self.left_out.stand_in.is_some() && section.kind() == "probe" => Ok(()),
             "probe" if is_left_over(self.config, section) => Ok(()),
             "probe" | "smart_effector" => self.probe(section),
             "bltouch" => self.bltouch(section),

@@ -31,6 +31,9 @@ use crate::attempt;
 
 /// How long klippy may take. It ends after some two seconds on a Raspberry Pi 3.
 const TIMEOUT: Duration = Duration::from_secs(60);
+/// How long it may take to end once it has read all of a configuration. Some modules then wait for a chip's answer, and
+/// nobody answers.
+const READY_TIME: Duration = Duration::from_secs(3);
 /// Longest output that is read.
 const OUTPUT_MAX: u64 = 4 << 20;
 /// klippy's words when it has read all of a configuration.
@@ -55,18 +58,18 @@ impl Klippy {
         Some(Klippy { folder, python })
     }
 
-    /// Asks it about a configuration without the sections `left_out`. Returns whether it has judged.
+    /// Asks it about a configuration. Returns whether it has judged.
     ///
     /// # Errors
     ///
     /// klippy refuses the configuration: its words, with the line.
-    pub(super) fn judge(&self, own: &Own, left_out: &[&str]) -> Result<bool, Trouble> {
+    pub(super) fn judge(&self, own: &Own) -> Result<bool, Trouble> {
         // Files that root can read are not for the user as whom klippy could run.
         if geteuid().is_root() {
             self.unasked("it never runs as root: call this as an ordinary user");
             return Ok(false);
         }
-        match self.output(own, left_out) {
+        match self.output(own) {
             Ok(output) => match refusal(&output) {
                 // A module may ask for pins that no option names, and the simulated MCUs have none of these.
                 Some(words) if words.contains("is not a valid pin name") => {
@@ -96,9 +99,8 @@ impl Klippy {
     }
 
     /// What klippy says.
-    fn output(&self, own: &Own, left_out: &[&str]) -> io::Result<String> {
-        let folder =
-            Folder::make(own, left_out, None, None).map_err(|trouble| io::Error::other(trouble.to_string()))?;
+    fn output(&self, own: &Own) -> io::Result<String> {
+        let folder = Folder::make(own, None, None).map_err(|trouble| io::Error::other(trouble.to_string()))?;
         let output = self.run(own, &folder);
         // It is in /tmp. What is left of it does no harm.
         let _ = fs::remove_dir_all(&folder.path);
@@ -125,16 +127,24 @@ impl Klippy {
         command.args(arguments).env("PYTHONDONTWRITEBYTECODE", "1").env("GIT_DIR", folder.path.join("none"));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(out);
         let mut child = command.spawn()?;
-        let until = Instant::now() + TIMEOUT;
+        let output = || Ok::<_, io::Error>(String::from_utf8_lossy(&foreign::read(&said, OUTPUT_MAX)?).into_owned());
+        let mut until = Instant::now() + TIMEOUT;
+        let mut is_configured = false;
         while child.try_wait()?.is_none() {
+            if !is_configured && output()?.contains(CONFIGURED) {
+                (is_configured, until) = (true, Instant::now() + READY_TIME);
+            }
             if Instant::now() > until {
                 child.kill()?;
                 child.wait()?;
+                if is_configured {
+                    break;
+                }
                 return Err(io::ErrorKind::TimedOut.into());
             }
-            thread::sleep(Duration::from_millis(20));
+            thread::sleep(Duration::from_millis(50));
         }
-        Ok(String::from_utf8_lossy(&foreign::read(&said, OUTPUT_MAX)?).into_owned())
+        output()
     }
 }
 

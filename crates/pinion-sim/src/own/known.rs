@@ -27,7 +27,7 @@ fn known() -> impl Iterator<Item = &'static str> {
     KNOWN.lines().filter(|line| !line.starts_with('#')).flat_map(str::split_whitespace)
 }
 
-fn is_numbered(word: &str, prefix: &str) -> bool {
+pub(super) fn is_numbered(word: &str, prefix: &str) -> bool {
     word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))
 }
 

@@ -4,7 +4,7 @@
 //! - `translate`: sections become a description, as a table of TOML; `motion`, `heat`, `devices` are its parts
 //! - `sensors`: the tables of thermistors and amplifiers
 //! - `klippy`: klippy's own verdict; without a klippy, `rules` and `claims` find the most frequent mistakes
-//! - `known`: the sections of Klipper and Kalico
+//! - `known`: the sections of Klipper and Kalico; `plugins`: those that the copy is without
 //! - `serve`: the folder with the copy that klippy gets
 
 pub(crate) mod args;
@@ -16,6 +16,7 @@ mod heat;
 mod klippy;
 mod known;
 mod motion;
+mod plugins;
 mod rules;
 pub(crate) mod run;
 mod sensors;

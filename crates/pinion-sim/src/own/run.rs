@@ -9,13 +9,12 @@ use std::path::{Path, PathBuf};
 use nix::unistd::geteuid;
 use pinion_linux::foreign::plain;
 use pinion_linux::own_folder::OwnFolder;
-use pinion_printer_config::{Config, Section, Trouble};
+use pinion_printer_config::Trouble;
 use toml::Table;
 
 use super::args::OwnArgs;
 use super::klippy::Klippy;
-use super::known::lacks_module;
-use super::serve::{Folder, Own, section_of};
+use super::serve::{Folder, Own, Reading, section_of};
 use super::translate::check;
 use crate::description::text;
 
@@ -32,24 +31,23 @@ pub(crate) fn is_printer_cfg(path: &Path) -> bool {
 pub(crate) fn read(path: &Path, args: &OwnArgs) -> Result<Own, Trouble> {
     let over = args.with.as_deref().map(table).transpose()?;
     let klippy = Klippy::of(args);
-    let own = Own::read(path, args.built_like.as_deref(), over, args.pace(), klippy.is_none())?;
+    let klipper = args.klipper();
+    let reading = Reading {
+        built_like: args.built_like.as_deref(),
+        over,
+        pace: args.pace(),
+        without_plugins: args.without_plugins,
+        klipper: klipper.as_deref(),
+        is_checked: klippy.is_none(),
+    };
+    let own = Own::read(path, reading)?;
     if let Some(klippy) = klippy
-        && !klippy.judge(&own, &left_out(&own.config, args))?
+        && !klippy.judge(&own)?
     {
         check(&own.config)?;
     }
     own.notes.iter().for_each(|note| log::warn!("{note}"));
     Ok(own)
-}
-
-/// The sections that klippy's copy is without.
-fn left_out<'a>(config: &'a Config, args: &OwnArgs) -> Vec<&'a str> {
-    if !args.without_plugins {
-        return Vec::new();
-    }
-    let klipper = args.klipper();
-    let is_out = |section: &&Section| lacks_module(section.kind(), klipper.as_deref());
-    config.sections().iter().filter(is_out).map(|section| section.name.as_str()).collect()
 }
 
 /// A description that lies over another one.
@@ -81,11 +79,10 @@ impl Place {
             let trouble = Trouble::new("there is no klippy/klippy.py in it").of(klipper.display());
             return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper"));
         }
-        let left_out = left_out(&own.config, args);
-        if !left_out.is_empty() {
-            log::info!("klippy's copy is without [{}]", left_out.join("], ["));
+        if !own.left_out.sections.is_empty() {
+            log::info!("klippy's copy is without [{}]", own.left_out.sections.join("], ["));
         }
-        Folder::make(own, &left_out, args.folder.as_deref(), link).map(Place::Folder)
+        Folder::make(own, args.folder.as_deref(), link).map(Place::Folder)
     }
 
     /// The links of all MCUs, the main one's first.

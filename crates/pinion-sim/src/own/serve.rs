@@ -16,6 +16,7 @@ use pinion_printer_config::{Config, Section, Trouble};
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
+use super::plugins::{LeftOut, StandIn};
 use super::translate::{Pace, Pins, Translated, check, translate};
 use crate::boards::links_of;
 
@@ -35,50 +36,64 @@ pub(crate) struct Own {
     /// The MCUs, the main one first.
     pub(crate) mcus: Vec<String>,
     pub(crate) notes: Vec<Trouble>,
+    /// What klippy's copy is without.
+    pub(super) left_out: LeftOut,
+}
+
+/// How a printer.cfg is read.
+pub(super) struct Reading<'a> {
+    /// The printer.cfg of the printer, if it is another one.
+    pub(super) built_like: Option<&'a Path>,
+    /// A description that lies over the one that comes out of it.
+    pub(super) over: Option<Table>,
+    pub(super) pace: Pace,
+    /// Whether the sections of plugins are left out.
+    pub(super) without_plugins: bool,
+    /// The checkout of the klippy, if it is known.
+    pub(super) klipper: Option<&'a Path>,
+    /// Whether no klippy is asked later.
+    pub(super) is_checked: bool,
 }
 
 impl Own {
-    /// Reads a printer.cfg. `built_like` is the printer.cfg of the printer, if it is another one. `over` is a description
-    /// that lies over the one that comes out of it. `is_checked`: no klippy is asked later.
+    /// Reads a printer.cfg.
     ///
     /// # Errors
     ///
     /// It is no printer, or has a mistake.
-    pub(crate) fn read(
-        path: &Path,
-        built_like: Option<&Path>,
-        over: Option<Table>,
-        pace: Pace,
-        is_checked: bool,
-    ) -> Result<Own, Trouble> {
-        let (config, translated) = read(path, pace, is_checked)?;
+    pub(super) fn read(path: &Path, reading: Reading<'_>) -> Result<Own, Trouble> {
+        let (config, left_out, translated) = read(path, &reading)?;
         let Translated { mut description, mcus, pins, notes } = translated;
-        if let Some(built_like) = built_like {
-            let (_, built) = read(built_like, pace, true)?;
+        if let Some(built_like) = reading.built_like {
+            let (_, _, built) = read(built_like, &reading)?;
             if built.mcus != mcus {
                 let cause = format!("it has the MCUs {}, and {} has others", built.mcus.join(", "), path.display());
                 return Err(Trouble::new(cause).of(built_like.display()).remedy("name a printer.cfg of this printer"));
             }
             description = with_places_of(built, &description, &pins);
         }
-        if let Some(over) = over {
+        if let Some(over) = reading.over {
             lay_over(&mut description, over);
         }
         let name = path.display();
         let description = toml::to_string(&description).map_err(|error| Trouble::new(error.to_string()).of(&name))?;
         let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
-        Ok(Own { config, sim, description, mcus, notes })
+        Ok(Own { config, sim, description, mcus, notes, left_out })
     }
 }
 
-fn read(path: &Path, pace: Pace, is_checked: bool) -> Result<(Config, Translated), Trouble> {
+fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translated), Trouble> {
     let mut config = Config::read(path)?;
     config.put_constants_in();
-    if is_checked {
+    if reading.is_checked {
         check(&config)?;
     }
-    let translated = translate(&config, pace)?;
-    Ok((config, translated))
+    let left_out = match reading.without_plugins {
+        true => LeftOut::of(&config, reading.klipper)?,
+        false => LeftOut::default(),
+    };
+    let translated = translate(&config, reading.pace, &left_out)?;
+    Ok((config, left_out, translated))
 }
 
 /// The printer with the pins and buses that another configuration names, too. Nothing is at them.
@@ -154,18 +169,12 @@ pub(crate) fn section_of(mcu: &str) -> String {
 }
 
 impl Folder {
-    /// Makes the folder and the copy, without the sections `left_out`. `link` is the main MCU's link, if it is not in the
-    /// folder.
+    /// Makes the folder and the copy. `link` is the main MCU's link, if it is not in the folder.
     ///
     /// # Errors
     ///
     /// It cannot be written, or has files of somebody else.
-    pub(super) fn make(
-        own: &Own,
-        left_out: &[&str],
-        named: Option<&Path>,
-        link: Option<&Path>,
-    ) -> Result<Folder, Trouble> {
+    pub(super) fn make(own: &Own, named: Option<&Path>, link: Option<&Path>) -> Result<Folder, Trouble> {
         let path = match named {
             Some(named) => new_or_ours(named)?,
             None => nix::unistd::mkdtemp("/tmp/pinion-sim-XXXXXX").map_err(|error| {
@@ -223,13 +232,14 @@ impl Folder {
             ..Change::default()
         });
         changes.extend(phases);
+        let LeftOut { sections: left_out, stand_in } = own.left_out.clone();
         changes.extend(left_out.iter().map(|section| Change {
-            section: (*section).to_owned(),
+            section: section.clone(),
             left_out: true,
+            instead: stand_in.as_ref().filter(|stand_in| stand_in.section == *section).map(StandIn::text),
             ..Change::default()
         }));
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
-        let left_out = left_out.iter().map(|section| (*section).to_owned()).collect();
         Ok(Folder { path, printer_cfg, links, left_out })
     }
 

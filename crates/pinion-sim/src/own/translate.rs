@@ -14,6 +14,7 @@ use toml::Table;
 use super::claims;
 use super::description::{Description, Entry};
 use super::known::{Kind, kind_of};
+use super::plugins::LeftOut;
 use super::rules;
 
 /// How fast the heaters are.
@@ -51,15 +52,16 @@ pub(super) fn check(config: &Config) -> Result<(), Trouble> {
     claims::check(config, &Aliases::read(config)?, &mcus(config)?)
 }
 
-/// Translates a configuration.
+/// Translates a configuration. The printer has all of it, but for a plain probe in the place of a plugin's.
 ///
 /// # Errors
 ///
 /// The first thing that klippy refuses, too, and without which there is no printer.
-pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Trouble> {
+pub(super) fn translate(config: &Config, pace: Pace, left_out: &LeftOut) -> Result<Translated, Trouble> {
     let (aliases, mcus) = (Aliases::read(config)?, mcus(config)?);
     let mut translator = Translator {
         config,
+        left_out,
         aliases,
         mcus,
         taken: HashMap::new(),
@@ -102,6 +104,7 @@ fn mcus(config: &Config) -> Result<Vec<String>, Trouble> {
 
 pub(super) struct Translator<'a> {
     pub(super) config: &'a Config,
+    pub(super) left_out: &'a LeftOut,
     aliases: Aliases,
     pub(super) mcus: Vec<String>,
     /// The pins with something at them, and the section with that thing.
@@ -278,7 +281,7 @@ impl Translator<'_> {
     fn strangers(&mut self) {
         let mut named = BTreeSet::new();
         for section in self.config.sections() {
-            if !named.insert(section.kind()) {
+            if self.left_out.sections.contains(&section.name) || !named.insert(section.kind()) {
                 continue;
             }
             match kind_of(section.kind()) {
