@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -16,16 +16,21 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::time::Ticks;
 use pinion_linux::clock::Monotonic;
 use pinion_printer_config::Trouble;
+use pinion_runtime::klippy::Checkout;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
+use crate::attempt::time::Time;
 use crate::attempt::{self, Attempt};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
+use crate::clock::{self, OneClock};
 use crate::description::read;
 use crate::own;
 use crate::own::args::OwnArgs;
@@ -97,7 +102,9 @@ struct Owner {
 impl Owner {
     fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
         let attempt = args.own.attempt()?;
-        let place = Place::make(&own, &args.own, args.symlink.as_deref())?;
+        let is_in_one_clock = attempt.as_ref().is_some_and(|attempt| !attempt.real_time);
+        let link = is_in_one_clock.then(|| PathBuf::from(format!("{}mcu", clock::MCUS)));
+        let place = Place::make(&own, &args.own, link.as_deref().or(args.symlink.as_deref()))?;
         Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
     }
 }
@@ -148,6 +155,11 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(owner) => owner,
         Err(error) => return failed(error),
     };
+    if let Some((owner, attempt)) = owner.as_ref().and_then(|owner| Some((owner, owner.attempt.as_ref()?)))
+        && !attempt.real_time
+    {
+        return try_in_one_clock(owner, attempt, config);
+    }
     let links = match &owner {
         Some(owner) => owner.place.links().to_vec(),
         None => boards::links(args.symlink.as_deref().unwrap_or(Path::new(LINK)), &config),
@@ -234,6 +246,26 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
+    }
+}
+
+/// Tries a printer whose klippy has the printer's clock.
+fn try_in_one_clock(owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
+    let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
+    let tried = || {
+        let ended = asked_to_end()?;
+        let clock = clock::clock();
+        let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
+        let forms = Checkout::read(&attempt.klipper.join("klippy"), FEATURES)
+            .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
+        let one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
+        let own = (&owner.own, owner.printer_cfg.as_path());
+        Ok::<bool, Trouble>(attempt::run(attempt, own, folder, &probe, Time::One(Box::new(one)), &ended))
+    };
+    match tried() {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(trouble) => failed(trouble),
     }
 }
 
@@ -335,7 +367,8 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
             realtime::leave();
         }
         if let Place::Folder(folder) = &owner.place {
-            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, &ended);
+            let time = Time::Real(Instant::now(), ended.clone());
+            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, time, &ended);
             right.store(passed, Ordering::SeqCst);
         }
         end();

@@ -5,14 +5,14 @@ mod host;
 mod place;
 mod report;
 pub(crate) mod rights;
-mod stall;
 mod steps;
+pub(crate) mod time;
 mod trial;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::time::Duration;
 
 use clap::builder::PossibleValuesParser;
 use pinion_printer_config::{Place, Trouble};
@@ -24,6 +24,7 @@ pub(crate) use host::Running;
 pub(crate) use report::Form;
 use report::{Outcome, Report};
 use steps::STEPS;
+use time::Time;
 use trial::Trial;
 
 /// The options of `--try`.
@@ -33,6 +34,8 @@ pub(crate) struct Attempt {
     pub(crate) python: PathBuf,
     /// A file to print in place of the small one.
     pub(crate) gcode: Option<PathBuf>,
+    /// klippy and the printer have the computer's clock.
+    pub(crate) real_time: bool,
     /// Only these steps, if there are any.
     pub(crate) only: Vec<String>,
     pub(crate) form: Form,
@@ -46,15 +49,16 @@ pub(crate) fn run(
     (own, printer): (&Own, &Path),
     folder: &Folder,
     probe: &SimProbe,
+    time: Time,
     ended: &AtomicBool,
 ) -> bool {
     let mut report = Report::new(attempt.form);
-    let since = Instant::now();
+    let began = time.now();
     report.progress("klippy starts");
-    let host = match Host::start(attempt, folder) {
+    let host = match Host::start(attempt, folder, time) {
         Ok(host) => host,
         Err(trouble) => {
-            report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, since);
+            report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, Duration::ZERO);
             report.end(printer, Some(&folder.path));
             return false;
         }
@@ -67,7 +71,7 @@ pub(crate) fn run(
         if !attempt.only.is_empty() && step.name != "ready" && !attempt.only.iter().any(|only| only == step.name) {
             continue;
         }
-        let since = if step.name == "ready" { since } else { Instant::now() };
+        let since = if step.name == "ready" { began } else { trial.host.now() };
         report.progress(step.name);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
@@ -76,7 +80,7 @@ pub(crate) fn run(
         if outcome.is_failure() {
             trial.recover(step.name);
         }
-        report.add(step.name, outcome, since);
+        report.add(step.name, outcome, trial.host.now().saturating_sub(since));
     }
     if let Err(trouble) = trial.keep() {
         log::warn!("{trouble}");
@@ -90,7 +94,7 @@ pub(crate) fn run(
 pub(crate) fn refused(printer: &Path, mistake: Trouble, form: Form) -> ExitCode {
     let mut report = Report::new(form);
     let (cause, place) = without_place(mistake);
-    report.add("read", Outcome::Failed { cause, place }, Instant::now());
+    report.add("read", Outcome::Failed { cause, place }, Duration::ZERO);
     report.end(printer, None);
     ExitCode::FAILURE
 }

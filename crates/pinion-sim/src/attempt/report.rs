@@ -4,7 +4,7 @@
 use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 
@@ -21,11 +21,6 @@ pub(super) enum Outcome {
         cause: String,
         place: Option<Place>,
     },
-    /// This computer made klippy or an MCU wait for so long that the step says nothing about the printer.
-    Slow {
-        cause: String,
-        stall: Duration,
-    },
     /// It was not tried, and why.
     Skipped(String),
 }
@@ -41,7 +36,7 @@ impl Outcome {
 
     /// Whether nothing shows that the step works.
     pub(super) fn is_failure(&self) -> bool {
-        matches!(self, Outcome::Failed { .. } | Outcome::Slow { .. })
+        matches!(self, Outcome::Failed { .. })
     }
 
     /// The result's word, its text, and the place of a mistake.
@@ -50,11 +45,6 @@ impl Outcome {
             Outcome::Passed(seen) => ("passed", seen.clone(), None),
             Outcome::Skipped(why) => ("skipped", why.clone(), None),
             Outcome::Failed { cause, place } => ("failed", cause.clone(), place.as_ref()),
-            Outcome::Slow { cause, stall } => {
-                let waited = format!("klippy or an MCU waited {:.2} s for a processor", stall.as_secs_f64());
-                let remedy = "end other programs, or add -r as root";
-                ("slow", format!("this computer is too slow: {waited}, and klippy says \"{cause}\": {remedy}"), None)
-            }
         }
     }
 }
@@ -93,16 +83,14 @@ impl Report {
         }
     }
 
-    /// A step ended.
-    pub(super) fn add(&mut self, name: &'static str, outcome: Outcome, since: Instant) {
-        let took = since.elapsed();
+    /// A step ended. It took this long on the printer.
+    pub(super) fn add(&mut self, name: &'static str, outcome: Outcome, took: Duration) {
         if self.form == Form::Lines {
             let mut page = Page::default();
             let (result, text, place) = outcome.parts();
             let mark = match result {
                 "passed" => "ok",
                 "skipped" => "-",
-                "slow" => "slow",
                 _ => "FAIL",
             };
             let place = place.map_or_else(String::new, |place| format!("{place}: "));
@@ -138,23 +126,11 @@ impl Report {
         match self.form {
             Form::Json => page = Page::json(&format!("{}\n", self.json(printer, folder))),
             Form::Lines => {
-                let names = |slow: bool| -> Vec<&str> {
-                    let of_kind = |step: &&Step| matches!(step.outcome, Outcome::Slow { .. }) == slow;
-                    self.failed().filter(of_kind).map(|step| step.name).collect()
-                };
-                let (failed, slow) = (names(false), names(true));
+                let failed: Vec<&str> = self.failed().map(|step| step.name).collect();
                 let name = printer.display();
-                match (&failed[..], &slow[..]) {
-                    ([], []) => page.line(format_args!("{name} works here: everything that was tried passed")),
-                    ([], slow) => {
-                        let steps = slow.join(", ");
-                        page.line(format_args!(
-                            "{name} was not tried to the end: this computer is too slow for {steps}"
-                        ));
-                    }
-                    (failed, _) => {
-                        page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", ")));
-                    }
+                match &failed[..] {
+                    [] => page.line(format_args!("{name} works here: everything that was tried passed")),
+                    failed => page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", "))),
                 }
                 if let Some(folder) = folder {
                     page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));

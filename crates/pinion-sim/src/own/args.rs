@@ -29,6 +29,10 @@ pub(crate) struct OwnArgs {
     #[arg(long, value_name = "STEP", requires = "attempt", value_delimiter = ',', value_parser = attempt::steps(),
         hide_possible_values = true)]
     only: Vec<String>,
+    /// Let klippy and the printer run by this computer's clock in --try. It takes minutes, and needs a computer that is
+    /// fast enough
+    #[arg(long, requires = "attempt")]
+    real_time: bool,
     /// Write the report of --try as JSON
     #[arg(long, requires = "attempt")]
     json: bool,
@@ -94,6 +98,7 @@ impl OwnArgs {
             klipper,
             python,
             gcode: self.gcode.clone(),
+            real_time: self.real_time,
             only: self.only.clone(),
             form: self.form(),
             running: Running::default(),
