@@ -378,11 +378,12 @@ impl Host {
     }
 }
 
-/// The library that gives klippy the printer's clock: beside this program, or in the package.
+/// The library that gives klippy the printer's clock.
 fn library() -> Result<PathBuf, Trouble> {
     let program = std::env::current_exe().and_then(std::fs::canonicalize).unwrap_or_default();
     let folder = program.parent().unwrap_or(Path::new("/"));
-    let places = [folder.join(LIBRARY), folder.join("../lib/pinion").join(LIBRARY)];
+    // cargo's place, and the package's.
+    let places = ["deps", "../lib/pinion-sim"].map(|place| folder.join(place).join(LIBRARY));
     places.into_iter().find(|place| place.is_file()).ok_or_else(|| {
         Trouble::new(format!("there is no {LIBRARY} beside {}", program.display()))
             .remedy("install the whole package, or add --real-time")
