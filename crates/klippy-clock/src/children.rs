@@ -84,6 +84,8 @@ fn forked(pid: libc::pid_t, word: usize) {
     match pid {
         0 => {
             turns::leave();
+            // SAFETY: a fork has one thread. What it starts is no participant either.
+            unsafe { libc::unsetenv(c"LD_PRELOAD".as_ptr()) };
             MINE.store(word as u32, Ordering::Relaxed);
             // SAFETY: it has the arguments that prctl(2) names. The child ends with klippy.
             unsafe { libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL) };

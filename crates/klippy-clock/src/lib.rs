@@ -31,11 +31,14 @@ mod real;
 mod threads;
 mod turns;
 
-use std::ffi::CStr;
+use std::ffi::{CStr, CString};
 
-/// The environment's word for this library: the descriptor of the socket, and the folder with the MCUs.
+/// The environment's word for this library: the descriptor of the socket, the number of the process that takes part (0: the
+/// one that reads this first), and the folder with the MCUs.
 const WORD: &CStr = c"PINION_CLOCK";
 
+/// Takes part, if this process is the one. A program that replaces itself by another one keeps its number, as a script
+/// that starts Python does. A child has another one.
 extern "C" fn begin() {
     // SAFETY: the process has one thread yet.
     let word = unsafe { libc::getenv(WORD.as_ptr()) };
@@ -44,13 +47,18 @@ extern "C" fn begin() {
     }
     // SAFETY: it ends with a zero.
     let word = unsafe { CStr::from_ptr(word) }.to_string_lossy().into_owned();
-    let Some((socket, folder)) = word.split_once(':') else { return };
-    let Ok(socket) = socket.parse() else { return };
-    // SAFETY: the process has one thread yet. Its children are no participants.
-    unsafe {
-        libc::unsetenv(WORD.as_ptr());
-        libc::unsetenv(c"LD_PRELOAD".as_ptr());
+    let mut parts = word.splitn(3, ':');
+    let number = |part: Option<&str>| part.and_then(|part| part.parse::<i32>().ok());
+    let (Some(socket), Some(pid), Some(folder)) = (number(parts.next()), number(parts.next()), parts.next()) else {
+        return;
+    };
+    let mine = std::process::id() as i32;
+    if pid != 0 && pid != mine {
+        return;
     }
+    let Ok(word) = CString::new(format!("{socket}:{mine}:{folder}")) else { return };
+    // SAFETY: the process has one thread yet, and both strings end with a zero.
+    unsafe { libc::setenv(WORD.as_ptr(), word.as_ptr(), 1) };
     descriptors::find_mcus_in(folder.into());
     turns::join(socket);
     children::begin();

@@ -3,7 +3,7 @@
 //!
 //! | from | bytes (little-endian) |
 //! |---|---|
-//! | klippy, once | "pinion1\0", its process number (u64) |
+//! | klippy, first; again if its process runs another program | "pinion1\0", its process number (u64) |
 //! | klippy | its time now, the time until which it waits, both in ns (u64); [`NEVER`] is no time |
 //! | printer | the time now in ns (u64), whether it has sent something (u64: 1 or 0) |
 //!
@@ -58,8 +58,6 @@ pub(crate) fn join(socket: i32) {
     let at: *mut libc::timespec = &raw mut wall;
     let clock = libc::CLOCK_REALTIME;
     real!(fn clock_gettime(clock: libc::clockid_t, at: *mut libc::timespec) -> libc::c_int);
-    // SAFETY: a flag of a descriptor.
-    unsafe { libc::fcntl(socket, libc::F_SETFD, libc::FD_CLOEXEC) };
     SOCKET.store(socket, Ordering::Relaxed);
     send(u64::from_le_bytes(*b"pinion1\0"), u64::from(std::process::id()));
     let (now, _) = receive();

@@ -3,8 +3,9 @@
 
 use std::fmt::Display;
 use std::io::{self, IsTerminal};
+use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -260,13 +261,30 @@ fn try_in_one_clock(owner: &Owner, attempt: &Attempt, config: SimConfig) -> Exit
             .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
         let one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
-        Ok::<bool, Trouble>(attempt::run(attempt, own, folder, &probe, Time::One(Box::new(one)), &ended))
+        match attempt::run(attempt, own, folder, &probe, Time::One(Box::new(one)), &ended) {
+            Some(passed) => Ok(passed),
+            None => Err(in_real_time(&attempt.python)),
+        }
     };
     match tried() {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
         Err(trouble) => failed(trouble),
     }
+}
+
+/// Starts this program anew, for a trial in real time.
+fn in_real_time(python: &Path) -> Trouble {
+    log::warn!(
+        "{} loads no library, as a static program or one with capabilities does, so the trial runs in real time: name \
+         another Python with --python",
+        python.display()
+    );
+    logging::finish();
+    let anew = std::env::current_exe()
+        .map(|program| Command::new(program).args(std::env::args_os().skip(1)).arg("--real-time").exec());
+    let error = anew.unwrap_or_else(|error| error);
+    Trouble::new(format!("the trial cannot run in real time: {error}")).remedy("name another Python with --python")
 }
 
 /// A flag that is set when the program is asked to end.
@@ -369,7 +387,7 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
         if let Place::Folder(folder) = &owner.place {
             let time = Time::Real(Instant::now(), ended.clone());
             let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, time, &ended);
-            right.store(passed, Ordering::SeqCst);
+            right.store(passed == Some(true), Ordering::SeqCst);
         }
         end();
     });

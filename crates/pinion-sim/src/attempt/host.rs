@@ -17,6 +17,7 @@ use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
+use super::report::Progress;
 use super::time::Time;
 use super::{Attempt, rights};
 use crate::clock::{self, LIBRARY, Stop};
@@ -58,6 +59,20 @@ impl From<Stop> for Refused {
     }
 }
 
+/// Why klippy did not start.
+pub(super) enum NoStart {
+    /// It takes no part in the printer's clock: its Python loads no library.
+    Alone,
+    /// Anything else.
+    Trouble(Trouble),
+}
+
+impl From<Trouble> for NoStart {
+    fn from(trouble: Trouble) -> NoStart {
+        NoStart::Trouble(trouble)
+    }
+}
+
 /// The number of the process that this program started, so that nothing of it stays when the program ends.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Running(Arc<AtomicI32>);
@@ -88,6 +103,7 @@ pub(super) struct Host {
     pub(super) time: Time,
     /// Records the nozzle's path while time passes.
     pub(super) recorder: Option<(Recorder, SimProbe)>,
+    pub(super) progress: Progress,
 }
 
 impl Host {
@@ -96,13 +112,13 @@ impl Host {
     /// # Errors
     ///
     /// It cannot be started, does not take part in the clock, or opens no API.
-    pub(super) fn start(attempt: &Attempt, folder: &Folder, mut time: Time) -> Result<Host, Trouble> {
+    pub(super) fn start(attempt: &Attempt, folder: &Folder, mut time: Time) -> Result<Host, NoStart> {
         let Attempt { klipper, python, running, .. } = attempt;
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
         if !program.is_file() {
             let trouble = failed("there is no klippy".into());
-            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR"));
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR").into());
         }
         let socket = folder.path.join("klippy.sock");
         let _ = std::fs::remove_file(&socket);
@@ -130,18 +146,25 @@ impl Host {
         })?;
         running.0.store(child.id().cast_signed(), Ordering::SeqCst);
         let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, _)| ours), &socket, folder);
-        let api = opened.map_err(|trouble| {
+        let api = opened.inspect_err(|_| {
             running.0.store(0, Ordering::SeqCst);
             let _ = child.kill();
             let _ = child.wait();
-            trouble.of(program.display())
+        });
+        let api = api.map_err(|error| match error {
+            NoStart::Trouble(trouble) => NoStart::Trouble(trouble.of(program.display())),
+            NoStart::Alone => NoStart::Alone,
         })?;
         let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
         let running = running.clone();
-        let recorder = None;
-        let mut host = Host { child, running, socket, api, buffer, next_id: 0, answers, said, time, recorder };
+        let (recorder, progress) = (None, Progress::new(attempt.form));
+        let mut host =
+            Host { child, running, socket, api, buffer, next_id: 0, answers, said, time, recorder, progress };
         let subscribed = host.subscribe();
-        subscribed.map(|()| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
+        match subscribed {
+            Ok(()) => Ok(host),
+            Err(refused) => Err(failed(format!("its API does not answer: {refused:?}")).into()),
+        }
     }
 
     /// Waits until klippy takes part in the clock and has opened its API.
@@ -151,15 +174,12 @@ impl Host {
         turns: Option<UnixStream>,
         socket: &Path,
         folder: &Folder,
-    ) -> Result<UnixStream, Trouble> {
+    ) -> Result<UnixStream, NoStart> {
         if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
             match clock.await_player(turns) {
                 Ok(()) => {}
-                Err(Stop::Ended) => return Err(no_start(&folder.path, true)),
-                Err(stop) => {
-                    let cause = format!("its Python does not take part in the printer's clock: {stop}");
-                    return Err(Trouble::new(cause).remedy("name another Python with --python, or add --real-time"));
-                }
+                Err(Stop::Computes) => return Err(NoStart::Alone),
+                Err(_) => return Err(no_start(&folder.path, true).into()),
             }
         }
         let until = time.now() + START;
@@ -170,7 +190,7 @@ impl Host {
             let passed = time.sleep(LOOK_FOR_API);
             let ended = passed.is_err() || child.try_wait().ok().flatten().is_some();
             if ended || time.now() > until {
-                return Err(no_start(&folder.path, ended));
+                return Err(no_start(&folder.path, ended).into());
             }
         }
     }
@@ -193,14 +213,16 @@ impl Host {
             if self.time.sleep(next - self.now()).is_err() {
                 return;
             }
-            self.read_path();
+            self.look();
         }
     }
 
-    fn read_path(&mut self) {
+    /// Does what has to be done now and then.
+    fn look(&mut self) {
         if let Some((recorder, probe)) = &mut self.recorder {
             recorder.read(probe.now());
         }
+        self.progress.show(self.time.now(), "");
     }
 
     /// Has klippy send its output.
@@ -263,7 +285,7 @@ impl Host {
             }
             let next = until.min(self.now() + READ_PATH);
             let is_there = self.time.await_bytes(&self.api, next)?;
-            self.read_path();
+            self.look();
             if !is_there {
                 continue;
             }

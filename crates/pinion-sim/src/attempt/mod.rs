@@ -19,8 +19,8 @@ use pinion_printer_config::{Place, Trouble};
 use pinion_sim::SimProbe;
 
 use crate::own::serve::{Folder, Own};
-use host::Host;
 pub(crate) use host::Running;
+use host::{Host, NoStart};
 pub(crate) use report::Form;
 use report::{Outcome, Report};
 use steps::STEPS;
@@ -43,7 +43,8 @@ pub(crate) struct Attempt {
     pub(crate) running: Running,
 }
 
-/// Tries a printer. Returns whether nothing failed. `ended` is set when the program is asked to end.
+/// Tries a printer. Returns whether nothing failed, or nothing if klippy takes no part in the printer's clock. `ended` is
+/// set when the program is asked to end.
 pub(crate) fn run(
     attempt: &Attempt,
     (own, printer): (&Own, &Path),
@@ -51,16 +52,16 @@ pub(crate) fn run(
     probe: &SimProbe,
     time: Time,
     ended: &AtomicBool,
-) -> bool {
+) -> Option<bool> {
     let mut report = Report::new(attempt.form);
     let began = time.now();
-    report.progress("klippy starts");
     let host = match Host::start(attempt, folder, time) {
         Ok(host) => host,
-        Err(trouble) => {
+        Err(NoStart::Alone) => return None,
+        Err(NoStart::Trouble(trouble)) => {
             report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, Duration::ZERO);
             report.end(printer, Some(&folder.path));
-            return false;
+            return Some(false);
         }
     };
     let mut trial = Trial::new(attempt, folder, own, probe, host);
@@ -72,7 +73,8 @@ pub(crate) fn run(
             continue;
         }
         let since = if step.name == "ready" { began } else { trial.host.now() };
-        report.progress(step.name);
+        let now = trial.host.now();
+        trial.host.progress.begin(step.name, now);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
             None => trial.tried(step),
@@ -87,7 +89,7 @@ pub(crate) fn run(
     }
     drop(trial);
     report.end(printer, Some(&folder.path));
-    report.passed() && !ended.load(Ordering::SeqCst)
+    Some(report.passed() && !ended.load(Ordering::SeqCst))
 }
 
 /// Reports a mistake that is found before klippy starts.

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The report of `--try`: one line for each step, then a verdict.
 
-use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
@@ -63,24 +62,54 @@ pub(crate) enum Form {
     Json,
 }
 
+/// A line on a terminal about what is under way.
+pub(super) struct Progress {
+    is_shown: bool,
+    doing: String,
+    /// When it began, by the printer's clock and by the computer's.
+    began: (Duration, Instant),
+    shown: Option<Instant>,
+}
+
+/// Real time between two lines.
+const SHOW: Duration = Duration::from_millis(200);
+
+impl Progress {
+    pub(super) fn new(form: Form) -> Progress {
+        let is_shown = form == Form::Lines && std::io::stdout().is_terminal();
+        Progress { is_shown, doing: String::new(), began: (Duration::ZERO, Instant::now()), shown: None }
+    }
+
+    /// Something begins, at this time of the printer.
+    pub(super) fn begin(&mut self, doing: &str, now: Duration) {
+        (self.doing, self.began, self.shown) = (plain(doing).into_owned(), (now, Instant::now()), None);
+        self.show(now, "");
+    }
+
+    /// Shows the line, if the last one is old.
+    pub(super) fn show(&mut self, now: Duration, more: &str) {
+        if !self.is_shown || self.shown.is_some_and(|shown| shown.elapsed() < SHOW) {
+            return;
+        }
+        self.shown = Some(Instant::now());
+        let (printer, computer) = (now.saturating_sub(self.began.0).as_secs(), self.began.1.elapsed().as_secs());
+        let mut out = std::io::stdout();
+        let doing = &self.doing;
+        let _ = write!(out, "\r{ERASE_LINE}  ...  {doing}: {printer} s of the printer in {computer} s{more}");
+        let _ = out.flush();
+    }
+}
+
 /// All steps.
 pub(super) struct Report {
     form: Form,
     steps: Vec<Step>,
+    began: Instant,
 }
 
 impl Report {
     pub(super) fn new(form: Form) -> Report {
-        Report { form, steps: Vec::new() }
-    }
-
-    /// On a terminal, what is under way.
-    pub(super) fn progress(&self, doing: impl Display) {
-        let mut out = std::io::stdout();
-        if self.form == Form::Lines && out.is_terminal() {
-            let _ = write!(out, "\r{ERASE_LINE}  ...  {}", plain(&doing.to_string()));
-            let _ = out.flush();
-        }
+        Report { form, steps: Vec::new(), began: Instant::now() }
     }
 
     /// A step ended. It took this long on the printer.
@@ -132,6 +161,9 @@ impl Report {
                     [] => page.line(format_args!("{name} works here: everything that was tried passed")),
                     failed => page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", "))),
                 }
+                let printer: Duration = self.steps.iter().map(|step| step.took).sum();
+                let (printer, computer) = (printer.as_secs_f64(), self.began.elapsed().as_secs_f64());
+                page.line(format_args!("{printer:.0} s of the printer took {computer:.0} s"));
                 if let Some(folder) = folder {
                     page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));
                 }

@@ -11,7 +11,7 @@ use pinion_sim::{Recorder, SimProbe, write_svg};
 use serde_json::Value;
 
 use super::Attempt;
-use super::host::{Host, Refused};
+use super::host::{Host, NoStart, Refused};
 use super::place::place_of;
 use super::report::Outcome;
 use super::steps::{Step, is_first};
@@ -138,7 +138,7 @@ impl<'a> Trial<'a> {
     }
 
     /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
-    fn restart(&mut self) -> Result<(), Trouble> {
+    fn restart(&mut self) -> Result<(), NoStart> {
         self.host.end();
         let time = self.host.take_time();
         self.host = Host::start(self.attempt, self.folder, time)?;

@@ -209,9 +209,15 @@ impl OneClock {
         turn[..8].copy_from_slice(&self.now_ns.to_le_bytes());
         turn[8..].copy_from_slice(&u64::from(self.has_news).to_le_bytes());
         self.has_news = false;
-        let mut socket = &player.socket;
-        socket.write_all(&turn).map_err(|_| Stop::Ended)?;
-        self.receive(&player.socket, &mut turn, Instant::now() + COMPUTE)?;
+        let given = turn;
+        loop {
+            (&player.socket).write_all(&given).map_err(|_| Stop::Ended)?;
+            self.receive(&player.socket, &mut turn, Instant::now() + COMPUTE)?;
+            // A script has started klippy's Python in its own place.
+            if turn[..8] != *HELLO {
+                break;
+            }
+        }
         let word = |at: usize| u64::from_le_bytes(turn[at..at + 8].try_into().unwrap_or_default());
         self.now_ns = self.now_ns.max(word(0));
         set(&self.clock, self.now_ns);
@@ -254,5 +260,5 @@ fn set(clock: &VirtualClock, ns: u64) {
 
 /// The word for the library of a klippy that inherits `socket`.
 pub(crate) fn word(socket: &UnixStream, folder: &Path) -> String {
-    format!("{}:{}", socket.as_raw_fd(), folder.display())
+    format!("{}:0:{}", socket.as_raw_fd(), folder.display())
 }
