@@ -112,7 +112,7 @@ impl Owner {
 
 /// A trial runs the programs in a printer.cfg, so root's rights are left before it.
 fn leave_root(args: &SimArgs, printer_cfg: &Path) -> Result<(), Trouble> {
-    if !args.own.attempt {
+    if !args.own.has_klippy() {
         return Ok(());
     }
     attempt::rights::leave_root(printer_cfg, args.own.folder.as_deref(), args.realtime)
@@ -261,8 +261,14 @@ fn try_in_one_clock(owner: &Owner, attempt: &Attempt, config: SimConfig) -> Exit
             .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
         let one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
-        match attempt::run(attempt, own, folder, &probe, Time::One(Box::new(one)), &ended) {
+        let time = Time::One(Box::new(one));
+        let done = match &attempt.print {
+            Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time)?,
+            None => attempt::run(attempt, own, folder, &probe, time, &ended),
+        };
+        match done {
             Some(passed) => Ok(passed),
+            None if attempt.print.is_some() => Err(alone(&attempt.python)),
             None => Err(in_real_time(&attempt.python)),
         }
     };
@@ -273,13 +279,16 @@ fn try_in_one_clock(owner: &Owner, attempt: &Attempt, config: SimConfig) -> Exit
     }
 }
 
+/// klippy's Python cannot have the printer's clock.
+fn alone(python: &Path) -> Trouble {
+    Trouble::new("it loads no library, like a static program or one with capabilities")
+        .of(python.display())
+        .remedy("name another Python with --python")
+}
+
 /// Starts this program anew, for a trial in real time.
 fn in_real_time(python: &Path) -> Trouble {
-    log::warn!(
-        "{} loads no library, as a static program or one with capabilities does, so the trial runs in real time: name \
-         another Python with --python",
-        python.display()
-    );
+    log::warn!("the trial runs in real time: {}", alone(python));
     logging::finish();
     let anew = std::env::current_exe()
         .map(|program| Command::new(program).args(std::env::args_os().skip(1)).arg("--real-time").exec());

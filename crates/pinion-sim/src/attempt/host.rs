@@ -2,6 +2,7 @@
 //! A klippy that this program starts, and its API server.
 
 use std::collections::HashMap;
+use std::fmt::{self, Display};
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -23,7 +24,7 @@ use super::{Attempt, rights};
 use crate::clock::{self, LIBRARY, Stop};
 use crate::own::serve::Folder;
 use pinion_printer_config::Trouble;
-use pinion_sim::{Recorder, SimProbe};
+use pinion_sim::{PaceWatch, Recorder, SimProbe};
 
 /// The end of a message.
 const END: u8 = 3;
@@ -51,6 +52,16 @@ pub(super) enum Refused {
     Late,
     /// klippy is gone.
     Gone(String),
+}
+
+impl Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Refused::Error(words) => f.write_str(words),
+            Refused::Late => f.write_str("it takes too long"),
+            Refused::Gone(why) => write!(f, "klippy is gone: {why}"),
+        }
+    }
 }
 
 impl From<Stop> for Refused {
@@ -102,8 +113,11 @@ pub(super) struct Host {
     pub(super) said: Vec<String>,
     pub(super) time: Time,
     /// Records the nozzle's path while time passes.
-    pub(super) recorder: Option<(Recorder, SimProbe)>,
+    pub(super) recorder: Option<Recorder>,
+    /// Watches how fast the motors are.
+    pub(super) paces: Option<PaceWatch>,
     pub(super) progress: Progress,
+    probe: SimProbe,
 }
 
 impl Host {
@@ -112,7 +126,7 @@ impl Host {
     /// # Errors
     ///
     /// It cannot be started, does not take part in the clock, or opens no API.
-    pub(super) fn start(attempt: &Attempt, folder: &Folder, mut time: Time) -> Result<Host, NoStart> {
+    pub(super) fn start(attempt: &Attempt, folder: &Folder, probe: &SimProbe, mut time: Time) -> Result<Host, NoStart> {
         let Attempt { klipper, python, running, .. } = attempt;
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
@@ -157,9 +171,23 @@ impl Host {
         })?;
         let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
         let running = running.clone();
-        let (recorder, progress) = (None, Progress::new(attempt.form));
-        let mut host =
-            Host { child, running, socket, api, buffer, next_id: 0, answers, said, time, recorder, progress };
+        let (recorder, paces, progress, probe) = (None, None, Progress::new(attempt.form), probe.clone());
+        let next_id = 0;
+        let mut host = Host {
+            child,
+            running,
+            socket,
+            api,
+            buffer,
+            next_id,
+            answers,
+            said,
+            time,
+            recorder,
+            paces,
+            progress,
+            probe,
+        };
         let subscribed = host.subscribe();
         match subscribed {
             Ok(()) => Ok(host),
@@ -219,10 +247,10 @@ impl Host {
 
     /// Does what has to be done now and then.
     fn look(&mut self) {
-        if let Some((recorder, probe)) = &mut self.recorder {
-            recorder.read(probe.now());
-        }
-        self.progress.show(self.time.now(), "");
+        let now = self.probe.now();
+        self.recorder.iter_mut().for_each(|recorder| recorder.read(now));
+        self.paces.iter_mut().for_each(|paces| paces.read(now));
+        self.progress.show(self.time.now());
     }
 
     /// Has klippy send its output.
@@ -315,6 +343,22 @@ impl Host {
                     stopped = (state != "ready").then_some(words);
                 }
                 answer => return answer.map(drop),
+            }
+        }
+    }
+
+    /// Waits until klippy is ready. The error is its words.
+    pub(super) fn until_ready(&mut self, limit: Duration) -> Result<(), String> {
+        let until = self.now() + limit;
+        loop {
+            match self.state() {
+                Ok((state, _)) if state == "ready" => return Ok(()),
+                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
+                Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
+                Ok(_) => self.sleep(Duration::from_millis(100)),
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if self.now() < until && self.reconnect() => {}
+                Err(refused) => return Err(format!("klippy does not answer: {refused}")),
             }
         }
     }

@@ -3,6 +3,7 @@
 
 mod host;
 mod place;
+pub(crate) mod print;
 mod report;
 pub(crate) mod rights;
 mod steps;
@@ -21,6 +22,7 @@ use pinion_sim::SimProbe;
 use crate::own::serve::{Folder, Own};
 pub(crate) use host::Running;
 use host::{Host, NoStart};
+use print::PrintOptions;
 pub(crate) use report::Form;
 use report::{Outcome, Report};
 use steps::STEPS;
@@ -34,6 +36,8 @@ pub(crate) struct Attempt {
     pub(crate) python: PathBuf,
     /// A file to print in place of the small one.
     pub(crate) gcode: Option<PathBuf>,
+    /// Print a file in place of the trial.
+    pub(crate) print: Option<PrintOptions>,
     /// klippy and the printer have the computer's clock.
     pub(crate) real_time: bool,
     /// Only these steps, if there are any.
@@ -55,7 +59,7 @@ pub(crate) fn run(
 ) -> Option<bool> {
     let mut report = Report::new(attempt.form);
     let began = time.now();
-    let host = match Host::start(attempt, folder, time) {
+    let host = match Host::start(attempt, folder, probe, time) {
         Ok(host) => host,
         Err(NoStart::Alone) => return None,
         Err(NoStart::Trouble(trouble)) => {

@@ -69,6 +69,8 @@ pub(super) struct Progress {
     /// When it began, by the printer's clock and by the computer's.
     began: (Duration, Instant),
     shown: Option<Instant>,
+    /// What follows the times.
+    more: String,
 }
 
 /// Real time between two lines.
@@ -77,24 +79,43 @@ const SHOW: Duration = Duration::from_millis(200);
 impl Progress {
     pub(super) fn new(form: Form) -> Progress {
         let is_shown = form == Form::Lines && std::io::stdout().is_terminal();
-        Progress { is_shown, doing: String::new(), began: (Duration::ZERO, Instant::now()), shown: None }
+        Progress {
+            is_shown,
+            doing: String::new(),
+            began: (Duration::ZERO, Instant::now()),
+            shown: None,
+            more: String::new(),
+        }
     }
 
     /// Something begins, at this time of the printer.
     pub(super) fn begin(&mut self, doing: &str, now: Duration) {
         (self.doing, self.began, self.shown) = (plain(doing).into_owned(), (now, Instant::now()), None);
-        self.show(now, "");
+        self.more.clear();
+        self.show(now);
+    }
+
+    /// What follows the times from now on.
+    pub(super) fn say(&mut self, more: String) {
+        self.more = more;
+    }
+
+    /// Takes the line away.
+    pub(super) fn end(&self) {
+        if self.is_shown {
+            let _ = write!(std::io::stdout(), "\r{ERASE_LINE}");
+        }
     }
 
     /// Shows the line, if the last one is old.
-    pub(super) fn show(&mut self, now: Duration, more: &str) {
+    pub(super) fn show(&mut self, now: Duration) {
         if !self.is_shown || self.shown.is_some_and(|shown| shown.elapsed() < SHOW) {
             return;
         }
         self.shown = Some(Instant::now());
         let (printer, computer) = (now.saturating_sub(self.began.0).as_secs(), self.began.1.elapsed().as_secs());
         let mut out = std::io::stdout();
-        let doing = &self.doing;
+        let Progress { doing, more, .. } = self;
         let _ = write!(out, "\r{ERASE_LINE}  ...  {doing}: {printer} s of the printer in {computer} s{more}");
         let _ = out.flush();
     }

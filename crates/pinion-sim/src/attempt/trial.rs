@@ -141,7 +141,7 @@ impl<'a> Trial<'a> {
     fn restart(&mut self) -> Result<(), NoStart> {
         self.host.end();
         let time = self.host.take_time();
-        self.host = Host::start(self.attempt, self.folder, time)?;
+        self.host = Host::start(self.attempt, self.folder, self.probe, time)?;
         Ok(())
     }
 
@@ -171,18 +171,7 @@ impl<'a> Trial<'a> {
 
     /// Waits until klippy is ready. The error is its words.
     pub(super) fn until_ready(&mut self) -> Result<(), String> {
-        let until = self.host.now() + READY;
-        loop {
-            match self.host.state() {
-                Ok((state, _)) if state == "ready" => return Ok(()),
-                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
-                Ok((_, words)) if self.host.now() > until => return Err(format!("klippy is not ready: {words}")),
-                Ok(_) => self.host.sleep(Duration::from_millis(100)),
-                // A klippy that finds its MCU shut down restarts both.
-                Err(Refused::Gone(_)) if self.host.now() < until && self.host.reconnect() => {}
-                Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
-            }
-        }
+        self.host.until_ready(READY)
     }
 
     /// The same for another klippy. Some wait for the user if they find an MCU shut down.

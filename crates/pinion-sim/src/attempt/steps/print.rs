@@ -85,14 +85,14 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.
 fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
-    trial.host.recorder = Some((trial.probe.recorder(), trial.probe.clone()));
+    trial.host.recorder = Some(trial.probe.recorder());
     let printed = print(trial);
     trial.host.sleep(Duration::from_millis(600));
-    let Some((mut recorder, probe)) = trial.host.recorder.take() else {
+    let Some(mut recorder) = trial.host.recorder.take() else {
         return Err(trial.failed("the path was not recorded", None));
     };
     // After a moment without a step the path ends.
-    recorder.read(Clock::from_ticks(probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
+    recorder.read(Clock::from_ticks(trial.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
     Ok((printed, recorder))
 }
 
