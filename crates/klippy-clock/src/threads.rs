@@ -133,11 +133,9 @@ impl Threads {
                 futex(token, libc::FUTEX_WAKE, 1);
                 return;
             }
-            if self.look(0) {
-                continue;
-            }
-            if children::hold_the_clock() {
-                self.look(children::LOOK_MS);
+            // In this order: what a child has written when it ended is there by now.
+            let is_held = children::hold_the_clock();
+            if self.look(if is_held { children::LOOK_MS } else { 0 }) || is_held {
                 continue;
             }
             let deadline_ns = self.waiting().map(|(_, thread)| thread.deadline_ns).min().unwrap_or(NEVER);

@@ -127,7 +127,7 @@ pub(crate) fn steps() -> PossibleValuesParser {
 /// There is none.
 pub(crate) fn klipper(named: Option<PathBuf>) -> Result<PathBuf, Trouble> {
     named.ok_or_else(|| {
-        Trouble::new("--try needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
+        Trouble::new("it needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
     })
 }
 

@@ -82,6 +82,8 @@ pub(crate) struct OneClock {
     player: Option<Player>,
     /// klippy may have something to read.
     has_news: bool,
+    /// klippy takes no more turns.
+    has_stopped: bool,
     /// Set when the program is asked to end.
     ended: Arc<AtomicBool>,
 }
@@ -112,7 +114,15 @@ impl OneClock {
             BoardMcu::new(board, forms.clone(), &path)
         });
         let mcus = mcus.collect::<Result<_, _>>()?;
-        Ok(OneClock { clock, now_ns: START.as_nanos() as u64, mcus, player: None, has_news: true, ended })
+        Ok(OneClock {
+            clock,
+            now_ns: START.as_nanos() as u64,
+            mcus,
+            player: None,
+            has_news: true,
+            has_stopped: false,
+            ended,
+        })
     }
 
     pub(crate) fn now(&self) -> Duration {
@@ -125,7 +135,7 @@ impl OneClock {
     ///
     /// There are too many descriptors.
     pub(crate) fn invite(&mut self) -> io::Result<(UnixStream, UnixStream)> {
-        self.player = None;
+        (self.player, self.has_stopped) = (None, false);
         self.mcus.iter_mut().for_each(BoardMcu::renew);
         let (ours, theirs) = UnixStream::pair()?;
         fcntl(&theirs, FcntlArg::F_SETFD(FdFlag::empty()))?;
@@ -160,6 +170,9 @@ impl OneClock {
     /// klippy takes no more turns.
     pub(crate) fn run(&mut self, until: Duration, is_over: &mut dyn FnMut() -> bool) -> Result<bool, Stop> {
         let until_ns = until.as_nanos() as u64;
+        if self.has_stopped {
+            return Err(Stop::Ended);
+        }
         loop {
             let player_ns = self.player.as_ref().map_or(u64::MAX, |player| player.until_ns);
             if self.player.is_some() && (self.has_news || self.now_ns >= player_ns) {
@@ -202,8 +215,14 @@ impl OneClock {
         }
     }
 
-    /// Gives klippy the turn, and waits until it comes back.
+    /// Gives klippy the turn, and waits until it comes back. A klippy that stops takes no more turns.
     fn pass_turn(&mut self) -> Result<(), Stop> {
+        let passed = self.try_pass_turn();
+        self.has_stopped = passed.is_err();
+        passed
+    }
+
+    fn try_pass_turn(&mut self) -> Result<(), Stop> {
         let Some(player) = &self.player else { return Err(Stop::Ended) };
         let mut turn = [0; 16];
         turn[..8].copy_from_slice(&self.now_ns.to_le_bytes());

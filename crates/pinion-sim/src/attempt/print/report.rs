@@ -100,8 +100,10 @@ impl Printed {
         for (phase, seconds) in self.phases.iter().filter(|(_, seconds)| *seconds >= 0.5) {
             page.line(format_args!("  {:<9} {}", phase.name(), span(*seconds)));
         }
-        if self.pauses > 0 {
-            page.line(format_args!("  it paused {} times, and was resumed each time", self.pauses));
+        match self.pauses {
+            0 => {}
+            1 => page.line("  it paused once, and was resumed"),
+            pauses => page.line(format_args!("  it paused {pauses} times, and was resumed each time")),
         }
         page.line(format_args!("filament   {:.2} m", self.filament_mm / 1000.0));
         page.line(format_args!("layers     {}", self.layers.len()));
@@ -110,13 +112,16 @@ impl Printed {
                 page.line(format_args!("  {:>5}  z {z_mm:>7.2} mm  {}", n + 1, span(*seconds)));
             }
         }
-        for Heated { name, target, most, off, .. } in &self.heaters {
+        for Heated { name, target, most, off, .. } in self.heaters.iter().filter(|heater| heater.target > 0.0) {
             let held =
                 if *off > 0.0 { format!(", at most {off:.1} C from its target once there") } else { String::new() };
             page.line(format_args!("{name}: target {target:.0} C, highest {most:.1} C{held}"));
         }
-        page.line("motor                steps/s      mm/s   mm/s2, the highest of each");
-        for Pace { name, steps_per_s, mm_per_s, mm_per_s2 } in &self.motors {
+        let moved: Vec<&Pace> = self.motors.iter().filter(|pace| pace.steps_per_s > 0.0).collect();
+        if !moved.is_empty() {
+            page.line("motor                steps/s      mm/s   mm/s2, the highest of each");
+        }
+        for Pace { name, steps_per_s, mm_per_s, mm_per_s2 } in moved {
             page.line(format_args!("  {name:<17} {steps_per_s:>8.0} {mm_per_s:>9.1} {mm_per_s2:>7.0}"));
         }
         match &self.compared {
