@@ -22,6 +22,7 @@ use printer::SimArgs;
 mod attempt;
 mod boards;
 mod camera;
+mod clock;
 mod demo;
 mod description;
 mod own;

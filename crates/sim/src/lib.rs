@@ -33,6 +33,7 @@ pub use description::pin::PinName;
 pub use description::thermistor::Thermistor;
 pub use engine::bed::{BedShape, Space};
 pub use engine::look::{Colour, Look};
+pub use engine::pace::{Pace, PaceWatch};
 pub use engine::recorder::{PathPoint, Recorder};
 pub use engine::ring::{RingWatch, Ringing};
 pub use part::accelerometer::{AccelerometerChip, AccelerometerConfig};

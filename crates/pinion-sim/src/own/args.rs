@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::Pace;
+use crate::attempt::print::PrintOptions;
 use crate::attempt::{self, Attempt, Form, Running};
 use pinion_printer_config::Trouble;
 
@@ -14,10 +15,21 @@ use pinion_printer_config::Trouble;
 pub(crate) struct OwnArgs {
     /// With a printer.cfg: start a klippy on a copy of it, and try everything: ready, homed, heated, leveled, printed.
     /// The exit status is 0 if nothing failed
-    #[arg(long = "try", conflicts_with_all = ["demo", "show", "print_config", "print_board"])]
+    #[arg(long = "try", group = "with_klippy", conflicts_with_all = ["demo", "show", "print_config", "print_board"])]
     pub(crate) attempt: bool,
-    /// The checkout of Klipper or Kalico that judges printer.cfg, and for --try; KLIPPER_DIR by default, or the one of
-    /// this computer's klippy
+    /// With a printer.cfg: start a klippy on a copy of it, and let it print this file, in the printer's own time. It says
+    /// how long the print takes, and what the motors and heaters did
+    #[arg(long, value_name = "FILE.gcode", group = "with_klippy",
+          conflicts_with_all = ["attempt", "demo", "show", "print_config", "print_board"])]
+    print: Option<PathBuf>,
+    /// List each layer of --print
+    #[arg(long, requires = "print")]
+    layers: bool,
+    /// Draw speed, temperatures and flow of --print into this file
+    #[arg(long, value_name = "FILE.svg", requires = "print")]
+    plot: Option<PathBuf>,
+    /// The checkout of Klipper or Kalico that judges printer.cfg, and for --try and --print; KLIPPER_DIR by default, or
+    /// the one of this computer's klippy
     #[arg(long, value_name = "DIR")]
     klipper: Option<PathBuf>,
     /// The Python for that klippy; KLIPPER_PYTHON, or ~/klippy-env, by default
@@ -30,8 +42,12 @@ pub(crate) struct OwnArgs {
     #[arg(long, value_name = "STEP", requires = "attempt", value_delimiter = ',', value_parser = attempt::steps(),
         hide_possible_values = true)]
     only: Vec<String>,
-    /// Write the report of --try as JSON
+    /// Let klippy and the printer run by this computer's clock in --try. It takes minutes, and needs a computer that is
+    /// fast enough
     #[arg(long, requires = "attempt")]
+    real_time: bool,
+    /// Write the report of --try or --print as JSON
+    #[arg(long, requires = "with_klippy")]
     json: bool,
     /// Heat as slowly as a real printer does
     #[arg(long)]
@@ -51,19 +67,24 @@ pub(crate) struct OwnArgs {
     #[arg(long, conflicts_with = "in_place_pty")]
     pub(crate) without_plugins: bool,
     /// Make no copy: put each pty where `serial` of printer.cfg expects it
-    #[arg(long, conflicts_with = "attempt")]
+    #[arg(long, conflicts_with = "with_klippy")]
     pub(crate) in_place_pty: bool,
 }
 
 impl OwnArgs {
     /// Whether an option needs a printer.cfg.
     pub(crate) fn is_used(&self) -> bool {
-        self.attempt
+        self.has_klippy()
             || self.built_like.is_some()
             || self.with.is_some()
             || self.folder.is_some()
             || self.in_place_pty
             || self.without_plugins
+    }
+
+    /// Whether this program starts a klippy, which runs the programs in a printer.cfg.
+    pub(crate) fn has_klippy(&self) -> bool {
+        self.attempt || self.print.is_some()
     }
 
     pub(crate) fn pace(&self) -> Pace {
@@ -85,13 +106,13 @@ impl OwnArgs {
         self.python.as_deref()
     }
 
-    /// The options of `--try`, if it is given.
+    /// The options of `--try` or `--print`, if one is given.
     ///
     /// # Errors
     ///
     /// There is no klippy.
     pub(crate) fn attempt(&self) -> Result<Option<Attempt>, Trouble> {
-        if !self.attempt {
+        if !self.has_klippy() {
             return Ok(None);
         }
         let klipper = attempt::klipper(self.klipper())?;
@@ -100,6 +121,12 @@ impl OwnArgs {
             klipper,
             python,
             gcode: self.gcode.clone(),
+            print: self.print.as_ref().map(|file| PrintOptions {
+                file: file.clone(),
+                layers: self.layers,
+                plot: self.plot.clone(),
+            }),
+            real_time: self.real_time,
             only: self.only.clone(),
             form: self.form(),
             running: Running::default(),

@@ -123,8 +123,12 @@ impl Klippy {
             arguments.push("-d".into());
             arguments.push(if number == 0 { path.into() } else { format!("{mcu}={}", path.display()).into() });
         }
-        let mut command = rights::confined(&self.python);
-        command.args(arguments).env("PYTHONDONTWRITEBYTECODE", "1").env("GIT_DIR", folder.path.join("none"));
+        let mut command = rights::confined();
+        command
+            .arg(&self.python)
+            .args(arguments)
+            .env("PYTHONDONTWRITEBYTECODE", "1")
+            .env("GIT_DIR", folder.path.join("none"));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(out);
         let mut child = command.spawn()?;
         let output = || Ok::<_, io::Error>(String::from_utf8_lossy(&foreign::read(&said, OUTPUT_MAX)?).into_owned());

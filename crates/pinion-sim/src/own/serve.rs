@@ -13,6 +13,7 @@ use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::copy::{self, Change};
 use pinion_printer_config::pins::MAIN;
 use pinion_printer_config::{Config, Section, Trouble};
+use pinion_runtime::klippy::is_host_path;
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
@@ -189,11 +190,14 @@ impl Folder {
         fs::write(path.join(MARK), "").map_err(|error| failed(&path, error))?;
         let main = link.map_or_else(|| path.join(MAIN), Path::to_owned);
         let links = links_of(&main, own.mcus.iter().map(String::as_str));
-        let served = |(mcu, link): (&String, &PathBuf)| Change {
-            section: section_of(mcu),
-            without: WAYS.map(str::to_owned).to_vec(),
-            with: vec![("serial".into(), link.display().to_string()), ("restart_method".into(), "command".into())],
-            ..Change::default()
+        let served = |(mcu, link): (&String, &PathBuf)| {
+            let mut with = vec![("serial".into(), link.display().to_string())];
+            // klippy knows no other method at such a path, and no option for it.
+            if !is_host_path(link) {
+                with.push(("restart_method".into(), "command".into()));
+            }
+            let without = WAYS.map(str::to_owned).to_vec();
+            Change { section: section_of(mcu), without, with, ..Change::default() }
         };
         let mut changes: Vec<Change> = own.mcus.iter().zip(&links).map(served).collect();
         let elsewhere = |section: &str, key: &str, value: &Path| Change {

@@ -2,8 +2,6 @@
 //! A print, and the path of the nozzle against the file.
 
 use std::io::BufReader;
-use std::sync::mpsc::{self, RecvTimeoutError};
-use std::thread;
 use std::time::Duration;
 
 use pinion::cli::files;
@@ -87,24 +85,15 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.
 fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
-    let (stop, stopped) = mpsc::channel::<()>();
-    let mut recorder = trial.probe.recorder();
-    let watched = trial.probe.clone();
-    let recording = thread::spawn(move || {
-        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
-            recorder.read(watched.now());
-        }
-        let late = u64::from(Ticks::from_ms(450).0);
-        recorder.read(Clock::from_ticks(watched.now().ticks() + late));
-        recorder
-    });
+    trial.host.recorder = Some(trial.probe.recorder());
     let printed = print(trial);
-    thread::sleep(Duration::from_millis(600));
-    drop(stop);
-    match recording.join() {
-        Ok(recorder) => Ok((printed, recorder)),
-        Err(_) => Err(trial.failed("the path was not recorded", None)),
-    }
+    trial.host.sleep(Duration::from_millis(600));
+    let Some(mut recorder) = trial.host.recorder.take() else {
+        return Err(trial.failed("the path was not recorded", None));
+    };
+    // After a moment without a step the path ends.
+    recorder.read(Clock::from_ticks(trial.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
+    Ok((printed, recorder))
 }
 
 /// Sends a block of a file.

@@ -1,0 +1,283 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! One clock for a klippy and the simulated printer.
+//!
+//! Both take turns. The printer runs its MCUs in virtual time until klippy waits for something: until a time comes, or
+//! until an MCU has sent something. Then klippy has the turn until it waits again. Computing takes no time on either side,
+//! so nothing is ever late, on any computer. klippy takes part by a library (crates/klippy-clock), which has the messages
+//! of the turns.
+
+mod mcu;
+mod workers;
+
+use std::fmt::{self, Display};
+use std::io::{self, Read, Write};
+use std::os::fd::AsRawFd;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+use pinion_firmware::mcu::Forms;
+use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource as _, VirtualClock};
+use pinion_firmware::trouble::Trouble;
+use pinion_sim::SimBoard;
+
+use mcu::BoardMcu;
+
+/// The library in klippy.
+pub(crate) const LIBRARY: &str = "libpinion_clock.so";
+/// The environment's word for it.
+pub(crate) const WORD: &str = "PINION_CLOCK";
+/// Beginning of the paths that the library takes for the simulated MCUs'.
+pub(crate) const MCUS: &str = "/tmp/klipper_host_clock_";
+/// The printer's time at the start. klippy takes a time near zero for none at all.
+const START: Duration = Duration::from_secs(1000);
+/// The first word of the library.
+const HELLO: &[u8; 8] = b"pinion1\0";
+/// How long, in real time, klippy's Python may take to load the library.
+const LOAD: Duration = Duration::from_secs(20);
+/// How long, in real time, klippy may compute until it waits for something.
+const COMPUTE: Duration = Duration::from_secs(120);
+/// Real time between two looks whether the program shall end.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// Why klippy takes no more turns.
+#[derive(Debug)]
+pub(crate) enum Stop {
+    /// It has ended.
+    Ended,
+    /// It computes without an end.
+    Computes,
+    /// The program is asked to end.
+    Asked,
+}
+
+impl Display for Stop {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Stop::Ended => f.write_str("klippy ended"),
+            Stop::Computes => {
+                let seconds = COMPUTE.as_secs();
+                write!(f, "klippy has computed for {seconds} s and waits for nothing: look for an endless loop")
+            }
+            Stop::Asked => f.write_str("the trial was ended"),
+        }
+    }
+}
+
+/// klippy's end of the turns.
+struct Player {
+    socket: UnixStream,
+    /// Until when it waits.
+    until_ns: u64,
+}
+
+/// A klippy and a printer in one clock.
+pub(crate) struct OneClock {
+    clock: VirtualClock,
+    now_ns: u64,
+    mcus: Vec<BoardMcu>,
+    player: Option<Player>,
+    /// klippy may have something to read.
+    has_news: bool,
+    /// klippy takes no more turns.
+    has_stopped: bool,
+    /// Set when the program is asked to end.
+    ended: Arc<AtomicBool>,
+}
+
+/// The clock of a printer before it runs.
+pub(crate) fn clock() -> VirtualClock {
+    VirtualClock::at(Clock::from_ticks(START.as_nanos() as u64 / NS_PER_TICK))
+}
+
+impl OneClock {
+    /// The boards of a printer whose time is `clock`. klippy finds them by `links`, which lead to sockets in `folder`.
+    ///
+    /// # Errors
+    ///
+    /// A socket cannot be made.
+    pub(crate) fn new(
+        clock: VirtualClock,
+        boards: Vec<SimBoard>,
+        (links, folder): (&[PathBuf], &Path),
+        forms: &Forms,
+        ended: Arc<AtomicBool>,
+    ) -> Result<OneClock, Trouble> {
+        let socket = |link: &PathBuf| folder.join(link.to_string_lossy().trim_start_matches(MCUS));
+        let mcus = boards.into_iter().zip(links).map(|(board, link)| {
+            let path = socket(link);
+            // An earlier trial has left it.
+            let _ = std::fs::remove_file(&path);
+            BoardMcu::new(board, forms.clone(), &path)
+        });
+        let mcus = mcus.collect::<Result<_, _>>()?;
+        Ok(OneClock {
+            clock,
+            now_ns: START.as_nanos() as u64,
+            mcus,
+            player: None,
+            has_news: true,
+            has_stopped: false,
+            ended,
+        })
+    }
+
+    pub(crate) fn now(&self) -> Duration {
+        Duration::from_nanos(self.now_ns)
+    }
+
+    /// A socket for another klippy, which inherits the second end.
+    ///
+    /// # Errors
+    ///
+    /// There are too many descriptors.
+    pub(crate) fn invite(&mut self) -> io::Result<(UnixStream, UnixStream)> {
+        (self.player, self.has_stopped) = (None, false);
+        self.mcus.iter_mut().for_each(BoardMcu::renew);
+        let (ours, theirs) = UnixStream::pair()?;
+        fcntl(&theirs, FcntlArg::F_SETFD(FdFlag::empty()))?;
+        Ok((ours, theirs))
+    }
+
+    /// Waits until klippy takes part.
+    ///
+    /// # Errors
+    ///
+    /// It does not, because its program does not load the library, or has ended.
+    pub(crate) fn await_player(&mut self, socket: UnixStream) -> Result<(), Stop> {
+        let mut hello = [0; 16];
+        self.receive(&socket, &mut hello, Instant::now() + LOAD)?;
+        if hello[..8] != *HELLO {
+            return Err(Stop::Ended);
+        }
+        self.player = Some(Player { socket, until_ns: 0 });
+        self.has_news = true;
+        Ok(())
+    }
+
+    /// klippy may have something to read: the caller has sent it something.
+    pub(crate) fn poke(&mut self) {
+        self.has_news = true;
+    }
+
+    /// Lets time pass until `until`, or until `is_over` says so behind a turn of klippy. Returns whether it did.
+    ///
+    /// # Errors
+    ///
+    /// klippy takes no more turns.
+    pub(crate) fn run(&mut self, until: Duration, is_over: &mut dyn FnMut() -> bool) -> Result<bool, Stop> {
+        let until_ns = until.as_nanos() as u64;
+        if self.has_stopped {
+            return Err(Stop::Ended);
+        }
+        loop {
+            let player_ns = self.player.as_ref().map_or(u64::MAX, |player| player.until_ns);
+            if self.player.is_some() && (self.has_news || self.now_ns >= player_ns) {
+                self.pass_turn()?;
+                for mcu in &mut self.mcus {
+                    mcu.take_in();
+                    self.has_news |= mcu.turn();
+                }
+                self.now_ns = self.now_ns.max(ns_of(&self.clock));
+                if is_over() {
+                    return Ok(true);
+                }
+                continue;
+            }
+            if self.now_ns >= until_ns {
+                return Ok(false);
+            }
+            self.has_news = self.run_mcus(until_ns.min(player_ns));
+        }
+    }
+
+    /// Runs the MCUs until a time, or until one of them sends something. Returns whether one did.
+    fn run_mcus(&mut self, until_ns: u64) -> bool {
+        loop {
+            let next = self.mcus.iter_mut().map(|mcu| (mcu.next_ns(), mcu)).min_by_key(|(next_ns, _)| *next_ns);
+            let Some((next_ns, mcu)) = next.filter(|(next_ns, _)| *next_ns <= until_ns) else {
+                self.now_ns = self.now_ns.max(until_ns);
+                set(&self.clock, self.now_ns);
+                return false;
+            };
+            // A board's clock that drifts may be a tick behind.
+            let at_ns = if next_ns <= self.now_ns { self.now_ns + NS_PER_TICK } else { next_ns };
+            set(&self.clock, at_ns);
+            let has_sent = mcu.turn();
+            // A pulse of the MCU itself takes time.
+            self.now_ns = ns_of(&self.clock);
+            if has_sent {
+                return true;
+            }
+        }
+    }
+
+    /// Gives klippy the turn, and waits until it comes back. A klippy that stops takes no more turns.
+    fn pass_turn(&mut self) -> Result<(), Stop> {
+        let passed = self.try_pass_turn();
+        self.has_stopped = passed.is_err();
+        passed
+    }
+
+    fn try_pass_turn(&mut self) -> Result<(), Stop> {
+        let Some(player) = &self.player else { return Err(Stop::Ended) };
+        let mut turn = [0; 16];
+        turn[..8].copy_from_slice(&self.now_ns.to_le_bytes());
+        turn[8..].copy_from_slice(&u64::from(self.has_news).to_le_bytes());
+        self.has_news = false;
+        let given = turn;
+        loop {
+            (&player.socket).write_all(&given).map_err(|_| Stop::Ended)?;
+            self.receive(&player.socket, &mut turn, Instant::now() + COMPUTE)?;
+            // A script has started klippy's Python in its own place.
+            if turn[..8] != *HELLO {
+                break;
+            }
+        }
+        let word = |at: usize| u64::from_le_bytes(turn[at..at + 8].try_into().unwrap_or_default());
+        self.now_ns = self.now_ns.max(word(0));
+        set(&self.clock, self.now_ns);
+        if let Some(player) = &mut self.player {
+            player.until_ns = word(8);
+        }
+        Ok(())
+    }
+
+    fn receive(&self, mut socket: &UnixStream, bytes: &mut [u8; 16], until: Instant) -> Result<(), Stop> {
+        let _ = socket.set_read_timeout(Some(LOOK));
+        let mut filled = 0;
+        while filled < bytes.len() {
+            match socket.read(&mut bytes[filled..]) {
+                Ok(0) => return Err(Stop::Ended),
+                Ok(read) => filled += read,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    if self.ended.load(Ordering::SeqCst) {
+                        return Err(Stop::Asked);
+                    }
+                    if Instant::now() > until {
+                        return Err(Stop::Computes);
+                    }
+                }
+                Err(_) => return Err(Stop::Ended),
+            }
+        }
+        Ok(())
+    }
+}
+
+fn ns_of(clock: &VirtualClock) -> u64 {
+    clock.now().ticks() * NS_PER_TICK
+}
+
+fn set(clock: &VirtualClock, ns: u64) {
+    clock.set(Clock::from_ticks(ns.div_ceil(NS_PER_TICK)));
+}
+
+/// The word for the library of a klippy that inherits `socket`.
+pub(crate) fn word(socket: &UnixStream, folder: &Path) -> String {
+    format!("{}:0:{}", socket.as_raw_fd(), folder.display())
+}
