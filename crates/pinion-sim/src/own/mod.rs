@@ -8,6 +8,7 @@
 //! - `serve`: the folder with the copy that klippy gets
 
 pub(crate) mod args;
+mod chips;
 mod claims;
 mod description;
 mod devices;

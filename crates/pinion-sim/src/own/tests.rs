@@ -90,6 +90,18 @@ fn a_wrong_chip_is_found_beside_a_plugin() {
 }
 
 #[test]
+fn a_pin_that_no_chip_has_is_a_mistake() {
+    for (from, to) in [("step_pin: PB9", "step_pin: PB130"), ("pin: PA7", "pin: PX3")] {
+        let refused = translated(&PRINTER.replacen(from, to, 1)).unwrap_err();
+        let pin = to.split(' ').nth(1).unwrap();
+        assert!(
+            refused.contains(&format!("Pin '{pin}' is not a valid pin name on mcu 'mcu': correct it")),
+            "{refused}"
+        );
+    }
+}
+
+#[test]
 fn a_max_temp_that_is_no_limit_insulates_nothing() {
     let loss = |max: &str| {
         let text = PRINTER.replace("max_temp: 110", &format!("max_temp: {max}"));

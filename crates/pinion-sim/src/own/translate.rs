@@ -11,11 +11,13 @@ use pinion_printer_config::{Config, Section, Trouble};
 use pinion_sim::MCUS_MAX;
 use toml::Table;
 
+use super::chips;
 use super::claims;
 use super::description::{Description, Entry};
 use super::known::{Kind, kind_of};
 use super::plugins::LeftOut;
 use super::rules;
+use super::serve::section_of;
 
 /// How fast the heaters are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -147,7 +149,14 @@ impl Translator<'_> {
             let reference = self.pin(scaled, "vref_pin")?;
             return Ok(self.aliases.resolve(&Pin { chip: reference.map_or(MAIN.into(), |pin| pin.chip), ..pin }));
         }
-        Ok(self.aliases.resolve(&pin))
+        let pin = self.aliases.resolve(&pin);
+        let mcu = self.config.section(&section_of(&pin.chip)).filter(|_| self.is_real(&pin));
+        // klippy does not see this: the simulated MCUs have each pin that the configuration names.
+        if let Some(names) = mcu.and_then(|mcu| chips::lacks(mcu.text("serial").unwrap_or_default(), &pin.name)) {
+            let cause = format!("Pin '{}' is not a valid pin name on mcu '{}'", pin.name, pin.chip);
+            return Err(section.trouble(key, cause).remedy(format!("correct it: this chip has at most {names}")));
+        }
+        Ok(pin)
     }
 
     /// Whether a pin is one of an MCU, and no virtual one.
