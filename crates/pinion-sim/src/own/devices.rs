@@ -306,13 +306,13 @@ impl Translator<'_> {
                 return Ok(());
             }
             let name = self.name_of("part", section);
-            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
             let part = part.set("address", address).set_if("reset_pin", self.take(section, "reset_pin")?);
             self.out.add("part", part);
         } else {
             let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
             let name = self.name_of("part", section);
-            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
             let part = part.set_if("select_pin", select).set_if("dc_pin", self.take(section, "dc_pin")?);
             let part = part.set_if("reset_pin", self.take(section, "reset_pin")?);
             self.out.add("part", part);

@@ -90,6 +90,15 @@ fn a_wrong_chip_is_found_beside_a_plugin() {
 }
 
 #[test]
+fn a_display_has_its_own_controller() {
+    for chip in ["ssd1306", "sh1106"] {
+        let text = format!("{PRINTER}\n[display]\nlcd_type: {chip}\ni2c_bus: i2c1\n");
+        let Translated { description, .. } = translated(&text).unwrap();
+        assert_eq!(named(&description, "part", "kind", "ssd1306")["chip"].as_str(), Some(chip));
+    }
+}
+
+#[test]
 fn a_pin_that_no_chip_has_is_a_mistake() {
     for (from, to) in [("step_pin: PB9", "step_pin: PB130"), ("pin: PA7", "pin: PX3")] {
         let refused = translated(&PRINTER.replacen(from, to, 1)).unwrap_err();
