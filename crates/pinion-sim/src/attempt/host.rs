@@ -228,6 +228,16 @@ impl Host {
         std::mem::replace(&mut self.time, Time::Real(Instant::now(), Arc::default()))
     }
 
+    /// klippy's process.
+    pub(super) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether klippy runs.
+    pub(super) fn is_there(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
     pub(super) fn now(&self) -> Duration {
         self.time.now()
     }
@@ -238,7 +248,7 @@ impl Host {
         while self.now() < until {
             let next = until.min(self.now() + READ_PATH);
             // A klippy that is gone does not answer the next question.
-            if self.time.sleep(next - self.now()).is_err() {
+            if self.time.sleep(next.saturating_sub(self.now())).is_err() {
                 return;
             }
             self.look();
