@@ -36,6 +36,9 @@ const START: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(30);
 /// Time between two reads of klippy's state while a command runs.
 const LOOK: Duration = Duration::from_secs(5);
+/// How long klippy is left alone when it is ready, as people do. It fills its display then: homing in the first second would
+/// come behind that, too late.
+const FIRST_MOMENTS: Duration = Duration::from_secs(3);
 /// How long klippy has to end in order, in real time.
 const END_TIME: Duration = Duration::from_secs(3);
 /// Time between two looks at an API that is not there yet.
@@ -362,7 +365,10 @@ impl Host {
         let until = self.now() + limit;
         loop {
             match self.state() {
-                Ok((state, _)) if state == "ready" => return Ok(()),
+                Ok((state, _)) if state == "ready" => {
+                    self.sleep(FIRST_MOMENTS);
+                    return Ok(());
+                }
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
                 Ok(_) => self.sleep(Duration::from_millis(100)),
