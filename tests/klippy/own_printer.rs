@@ -25,7 +25,7 @@ fn tried_on(checkout: &Path, cfg: &Path, printer: &Path, steps: &[&str], folder:
         let _ = fs::set_permissions(file, fs::Permissions::from_mode(0o755));
     }
     let mut command = Command::new(pinion_path());
-    command.args(["sim", "-r"]).arg(cfg).args(["--try", "--json", "--klipper"]).arg(checkout);
+    command.arg("sim").arg(cfg).args(["--try", "--json", "--klipper"]).arg(checkout);
     command.arg("--built-like").arg(printer).args(["--python", &python(), "--folder"]).arg(folder.join("sim"));
     steps.iter().for_each(|step| _ = command.args(["--only", step]));
     let done = command.output().unwrap();

@@ -159,7 +159,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     if let Some((owner, attempt)) = owner.as_ref().and_then(|owner| Some((owner, owner.attempt.as_ref()?)))
         && !attempt.real_time
     {
-        return try_in_one_clock(owner, attempt, config);
+        return run_in_one_clock(args, owner, attempt, config);
     }
     let links = match &owner {
         Some(owner) => owner.place.links().to_vec(),
@@ -250,25 +250,32 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
-/// Tries a printer whose klippy has the printer's clock.
-fn try_in_one_clock(owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
+/// Tries a printer whose klippy has the printer's clock, or prints on it, or serves it.
+fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
     let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
     let tried = || {
         let ended = asked_to_end()?;
         let clock = clock::clock();
+        let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
         let forms = Checkout::read(&attempt.klipper.join("klippy"), FEATURES)
             .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
-        let one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
+        let shown = OwnStatus::default();
+        camera.map_or(Ok(()), |camera| camera.start(probe.clone(), shown.clone()))?;
+        let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
+        attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
         let time = Time::One(Box::new(one));
         let done = match &attempt.print {
             Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time)?,
+            None if attempt.speed.is_some() => {
+                attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?
+            }
             None => attempt::run(attempt, own, folder, &probe, time, &ended),
         };
         match done {
             Some(passed) => Ok(passed),
-            None if attempt.print.is_some() => Err(alone(&attempt.python)),
+            None if attempt.print.is_some() || attempt.speed.is_some() => Err(alone(&attempt.python)),
             None => Err(in_real_time(&attempt.python)),
         }
     };

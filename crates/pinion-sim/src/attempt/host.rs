@@ -36,6 +36,9 @@ const START: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(30);
 /// Time between two reads of klippy's state while a command runs.
 const LOOK: Duration = Duration::from_secs(5);
+/// How long klippy is left alone when it is ready, as people do. It fills its display then: homing in the first second would
+/// come behind that, too late.
+const FIRST_MOMENTS: Duration = Duration::from_secs(3);
 /// How long klippy has to end in order, in real time.
 const END_TIME: Duration = Duration::from_secs(3);
 /// Time between two looks at an API that is not there yet.
@@ -228,6 +231,16 @@ impl Host {
         std::mem::replace(&mut self.time, Time::Real(Instant::now(), Arc::default()))
     }
 
+    /// klippy's process.
+    pub(super) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether klippy runs.
+    pub(super) fn is_there(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
     pub(super) fn now(&self) -> Duration {
         self.time.now()
     }
@@ -238,7 +251,7 @@ impl Host {
         while self.now() < until {
             let next = until.min(self.now() + READ_PATH);
             // A klippy that is gone does not answer the next question.
-            if self.time.sleep(next - self.now()).is_err() {
+            if self.time.sleep(next.saturating_sub(self.now())).is_err() {
                 return;
             }
             self.look();
@@ -352,7 +365,10 @@ impl Host {
         let until = self.now() + limit;
         loop {
             match self.state() {
-                Ok((state, _)) if state == "ready" => return Ok(()),
+                Ok((state, _)) if state == "ready" => {
+                    self.sleep(FIRST_MOMENTS);
+                    return Ok(());
+                }
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
                 Ok(_) => self.sleep(Duration::from_millis(100)),

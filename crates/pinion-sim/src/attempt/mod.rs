@@ -2,6 +2,7 @@
 //! `pinion sim PRINTER.CFG --try`: a klippy on the user's configuration does what every owner does after a change.
 
 mod host;
+pub(crate) mod paced;
 mod place;
 pub(crate) mod print;
 mod report;
@@ -36,6 +37,8 @@ pub(crate) struct Attempt {
     pub(crate) python: PathBuf,
     /// A file to print in place of the small one.
     pub(crate) gcode: Option<PathBuf>,
+    /// Let klippy run at this pace in place of the trial.
+    pub(crate) speed: Option<f64>,
     /// Print a file in place of the trial.
     pub(crate) print: Option<PrintOptions>,
     /// klippy and the printer have the computer's clock.

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use pinion_firmware::mcu::{DeviceWarning, Dialect, Forms, Mcu, Note, Outbox};
-use pinion_firmware::time::TimeSource;
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_protocol::block::{Received, Receiver, frame};
 use pinion_protocol::vlq;
@@ -19,6 +19,11 @@ use super::workers::Buses;
 
 /// Highest number of bytes for a klippy that does not read.
 const OUTPUT_BYTES_MAX: usize = 1 << 20;
+
+/// How long the MCU takes no commands behind `finalize_config`. klippy counts on the time that its start takes: it sets each
+/// output for 0.2 s later, and `[controller_fan]` sets one anew 0.1 s after that start, for 0.1 s later. klippy sends that
+/// only after the first time has come, which is too late if the start takes no time at all.
+const CONFIGURES: Ticks = Ticks::from_ms(50);
 
 /// What the MCU sends.
 #[derive(Clone, Default)]
@@ -63,6 +68,8 @@ pub(super) struct BoardMcu {
     responses: Responses,
     listener: UnixListener,
     connection: Option<Connection>,
+    /// No command runs before this time.
+    rests_until: Clock,
 }
 
 impl BoardMcu {
@@ -78,7 +85,7 @@ impl BoardMcu {
         let buses = Buses::new(clock.clone());
         let (workers, outbox) = (Box::new(buses.clone()), Box::new(responses.clone()));
         let mcu = Mcu::new(Arc::new(dialect), Box::new(board), timing, workers, outbox);
-        Ok(BoardMcu { mcu, clock, buses, responses, listener, connection: None })
+        Ok(BoardMcu { mcu, clock, buses, responses, listener, connection: None, rests_until: Clock::EPOCH })
     }
 
     /// Another process of klippy comes.
@@ -89,7 +96,8 @@ impl BoardMcu {
 
     /// When something happens next, in nanoseconds of the printer's time.
     pub(super) fn next_ns(&self) -> u64 {
-        let next = self.mcu.next_timer().into_iter().chain(self.buses.next_end()).min();
+        let rests = Some(self.rests_until).filter(|until| *until > self.clock.now());
+        let next = self.mcu.next_timer().into_iter().chain(self.buses.next_end()).chain(rests).min();
         next.map_or(u64::MAX, |next| self.clock.duration_of(next).as_nanos() as u64)
     }
 
@@ -131,7 +139,7 @@ impl BoardMcu {
     fn run_commands(&mut self) -> bool {
         let Some(connection) = &mut self.connection else { return false };
         let mut ran = false;
-        loop {
+        while self.clock.now() >= self.rests_until {
             let (payload, mut at) = match connection.block.take() {
                 Some(block) => block,
                 None => {
@@ -156,8 +164,12 @@ impl BoardMcu {
             };
             let mut commands = vlq::Reader::new(&payload[at..]);
             while !commands.is_empty() && self.mcu.may_run(commands.rest()) {
+                let was_finalized = self.mcu.is_finalized();
                 self.mcu.execute(&mut commands);
                 ran = true;
+                if self.mcu.is_finalized() && !was_finalized {
+                    self.rests_until = self.clock.now() + CONFIGURES;
+                }
             }
             at = payload.len() - commands.rest().len();
             if at < payload.len() || self.mcu.keeps_block() {
@@ -168,6 +180,7 @@ impl BoardMcu {
             connection.frame_all(&self.responses);
             frame(&[], connection.receiver.expected(), &mut connection.output);
         }
+        ran
     }
 
     /// Sends what the MCU has to say. Returns whether something was sent.

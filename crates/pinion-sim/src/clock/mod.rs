@@ -84,8 +84,35 @@ pub(crate) struct OneClock {
     has_news: bool,
     /// klippy takes no more turns.
     has_stopped: bool,
+    pace: Option<Pace>,
     /// Set when the program is asked to end.
     ended: Arc<AtomicBool>,
+}
+
+/// The highest pace of the printer's time.
+struct Pace {
+    /// Seconds of the printer in a second of the computer.
+    speed: f64,
+    /// A time of the computer, and the printer's time then.
+    from: (Instant, u64),
+}
+
+/// Time between two turns of klippy at a pace: somebody outside of the clock may have sent it something.
+const OUTSIDE: Duration = Duration::from_millis(4);
+/// How far the printer's time may be behind its pace and still catch up. What a busy computer loses beyond is lost.
+const BEHIND: Duration = Duration::from_millis(50);
+
+impl Pace {
+    /// The time that the printer may have by now.
+    fn until_ns(&mut self, now_ns: u64) -> u64 {
+        let (since, from_ns) = self.from;
+        let until_ns = from_ns + (since.elapsed().as_nanos() as f64 * self.speed) as u64;
+        let latest_ns = now_ns + (BEHIND.as_nanos() as f64 * self.speed) as u64;
+        if until_ns > latest_ns {
+            self.from = (Instant::now(), latest_ns);
+        }
+        until_ns.min(latest_ns)
+    }
 }
 
 /// The clock of a printer before it runs.
@@ -121,8 +148,14 @@ impl OneClock {
             player: None,
             has_news: true,
             has_stopped: false,
+            pace: None,
             ended,
         })
+    }
+
+    /// Keeps the printer's time to this many seconds in a second, if the computer is fast enough.
+    pub(crate) fn keep_pace(&mut self, speed: f64) {
+        self.pace = Some(Pace { speed, from: (Instant::now(), self.now_ns) });
     }
 
     pub(crate) fn now(&self) -> Duration {
@@ -190,7 +223,20 @@ impl OneClock {
             if self.now_ns >= until_ns {
                 return Ok(false);
             }
-            self.has_news = self.run_mcus(until_ns.min(player_ns));
+            let mut limit_ns = until_ns.min(player_ns);
+            if let Some(pace) = &mut self.pace {
+                let paced_ns = pace.until_ns(self.now_ns);
+                if paced_ns <= self.now_ns {
+                    if self.ended.load(Ordering::SeqCst) {
+                        return Err(Stop::Asked);
+                    }
+                    std::thread::sleep(OUTSIDE);
+                    self.has_news = true;
+                    continue;
+                }
+                limit_ns = limit_ns.min(paced_ns);
+            }
+            self.has_news = self.run_mcus(limit_ns);
         }
     }
 

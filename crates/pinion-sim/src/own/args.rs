@@ -22,6 +22,11 @@ pub(crate) struct OwnArgs {
     #[arg(long, value_name = "FILE.gcode", group = "with_klippy",
           conflicts_with_all = ["attempt", "demo", "show", "print_config", "print_board"])]
     print: Option<PathBuf>,
+    /// With a printer.cfg: start a klippy on a copy of it at this many times the pace of real time, for Mainsail, Fluidd and
+    /// --camera. On a slow computer it is slower, and never late
+    #[arg(long, value_name = "N", group = "with_klippy", value_parser = speed,
+          conflicts_with_all = ["attempt", "print", "demo", "show", "print_config", "print_board"])]
+    speed: Option<f64>,
     /// List each layer of --print
     #[arg(long, requires = "print")]
     layers: bool,
@@ -71,6 +76,12 @@ pub(crate) struct OwnArgs {
     pub(crate) in_place_pty: bool,
 }
 
+/// A pace. A very slow one would look like a printer that hangs.
+fn speed(text: &str) -> Result<f64, String> {
+    let speed = text.parse().ok().filter(|speed| (0.01..=1000.0).contains(speed));
+    speed.ok_or_else(|| "a number from 0.01 to 1000".to_owned())
+}
+
 impl OwnArgs {
     /// Whether an option needs a printer.cfg.
     pub(crate) fn is_used(&self) -> bool {
@@ -84,7 +95,7 @@ impl OwnArgs {
 
     /// Whether this program starts a klippy, which runs the programs in a printer.cfg.
     pub(crate) fn has_klippy(&self) -> bool {
-        self.attempt || self.print.is_some()
+        self.attempt || self.print.is_some() || self.speed.is_some()
     }
 
     pub(crate) fn pace(&self) -> Pace {
@@ -126,6 +137,7 @@ impl OwnArgs {
                 layers: self.layers,
                 plot: self.plot.clone(),
             }),
+            speed: self.speed,
             real_time: self.real_time,
             only: self.only.clone(),
             form: self.form(),
