@@ -119,6 +119,28 @@ fn the_description_of_a_printer_cfg_is_a_description() {
     assert!(laid.contains("start_mm = 77.0") && laid.matches("name = \"x\"").count() == 1, "{laid}");
 }
 
+#[test]
+fn a_print_says_what_it_needs() {
+    let (home, cfg) = folder_with("printer.cfg", PRINTER);
+    let cfg = cfg.to_str().unwrap();
+    let gcode = home.path().join("a.gcode");
+    fs::write(&gcode, "G28\n").unwrap();
+    let gcode = gcode.to_str().unwrap();
+    for (arguments, status, words) in [
+        (&["--print", "/nonexistent.gcode", "--klipper", "/nonexistent"][..], 1, "/nonexistent.gcode"),
+        (&["--print", gcode, "--klipper", "/nonexistent"], 1, "there is no klippy: name a checkout"),
+        (&["--print", gcode, "--klipper", "/nonexistent", "--plot", cfg], 1, "printer.cfg"),
+        (&["--print", gcode, "--try"], 2, "cannot be used with"),
+        (&["--layers"], 2, "--print"),
+        (&["--speed", "0"], 2, "a number from 0.01 to 1000"),
+    ] {
+        let (code, _, log) = output(&[&["sim", cfg], arguments].concat());
+        assert_eq!(code, Some(status), "{arguments:?}: {log}");
+        assert!(log.contains(words), "{arguments:?}: {log}");
+    }
+    assert!(fs::read_to_string(cfg).unwrap().contains("[printer]"), "the plot has replaced it");
+}
+
 /// A step that is misspelled would try nothing, and pass.
 #[test]
 fn an_unknown_step_of_a_try_is_refused() {

@@ -259,6 +259,10 @@ pub fn program_in(folder: &Path) -> PathBuf {
         return pinion.to_owned();
     }
     assert!(Command::new("cp").args([pinion, simulator::beside(pinion), folder]).status().unwrap().success());
+    let library = pinion.with_file_name("deps/libpinion_clock.so");
+    assert!(
+        Command::new("install").args(["-D", "-t"]).arg(folder.join("deps")).arg(library).status().unwrap().success()
+    );
     folder.join("pinion")
 }
 

@@ -295,7 +295,7 @@ fn alone(python: &Path) -> Trouble {
 
 /// Starts this program anew, for a trial in real time.
 fn in_real_time(python: &Path) -> Trouble {
-    log::warn!("the trial runs in real time: {}", alone(python));
+    log::warn!("the trial runs in real time: {} loads no library: name another Python with --python", python.display());
     logging::finish();
     let anew = std::env::current_exe()
         .map(|program| Command::new(program).args(std::env::args_os().skip(1)).arg("--real-time").exec());

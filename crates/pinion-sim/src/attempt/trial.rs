@@ -19,7 +19,7 @@ use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
 
 /// How long homing, leveling or a macro may take.
-pub(super) const LONG: Duration = Duration::from_secs(400);
+pub(super) const LONG: Duration = Duration::from_secs(1800);
 /// How long it may take until a fan turns.
 pub(super) const SOON: Duration = Duration::from_secs(30);
 /// How long klippy has to be ready.

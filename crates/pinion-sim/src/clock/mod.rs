@@ -327,3 +327,86 @@ fn set(clock: &VirtualClock, ns: u64) {
 pub(crate) fn word(socket: &UnixStream, folder: &Path) -> String {
     format!("{}:0:{}", socket.as_raw_fd(), folder.display())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::mcu::DialectName;
+    use pinion_protocol::block::{Sequence, frame};
+    use pinion_protocol::vlq::Writer;
+    use pinion_sim::{SimConfig, SimWorld};
+    use std::thread;
+
+    /// A klippy that asks an MCU for its dictionary's first bytes, and notes the times of its turns.
+    fn ask(turns: UnixStream, mcu: &Path) -> Vec<(u64, u64, usize)> {
+        let mut turns = turns;
+        let send = |turns: &mut UnixStream, words: [u64; 2]| {
+            turns.write_all(&[words[0].to_le_bytes(), words[1].to_le_bytes()].concat()).unwrap();
+        };
+        let hear = |turns: &mut UnixStream| {
+            let mut bytes = [0; 16];
+            turns.read_exact(&mut bytes).unwrap();
+            [0, 8].map(|at| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()))
+        };
+        send(&mut turns, [u64::from_le_bytes(*HELLO), 0]);
+        let [start_ns, _] = hear(&mut turns);
+        let mut wire = UnixStream::connect(mcu).unwrap();
+        wire.set_nonblocking(true).unwrap();
+        let mut seen = Vec::new();
+        let mut now_ns = start_ns;
+        let mut heard = [0; 4096];
+        for (is_asked, wait_ns) in [(true, 4_000_000_000), (false, 4_000_000_000), (false, 1_000_000)] {
+            if is_asked {
+                let mut command = Writer::default();
+                [1, 0, 40].into_iter().for_each(|number| command.int(number));
+                let mut block = Vec::new();
+                frame(command.payload().unwrap(), Sequence::default(), &mut block);
+                wire.write_all(&block).unwrap();
+            }
+            // A little computing. The MCU sends `stats` each five seconds.
+            now_ns += 40;
+            send(&mut turns, [now_ns, now_ns + wait_ns]);
+            let [then_ns, news] = hear(&mut turns);
+            seen.push((then_ns - now_ns, news, wire.read(&mut heard).unwrap_or(0)));
+            now_ns = then_ns;
+        }
+        seen
+    }
+
+    #[test]
+    fn an_answer_takes_no_time_and_a_wait_takes_all_of_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let clock = clock();
+        let config = SimConfig::parse(SimConfig::default_toml(), "the default").unwrap();
+        let SimWorld { boards, .. } = SimWorld::new(config, Arc::new(clock.clone())).unwrap();
+        let links = [PathBuf::from(format!("{MCUS}mcu"))];
+        let forms = Forms::from(DialectName::Master);
+        let mut one = OneClock::new(clock, boards, (&links, folder.path()), &forms, Arc::default()).unwrap();
+        let (ours, theirs) = one.invite().unwrap();
+        let mcu = folder.path().join("mcu");
+        let player = thread::spawn(move || ask(theirs, &mcu));
+        one.await_player(ours).unwrap();
+        let began = one.now();
+        assert!(!one.run(began + Duration::from_secs(2), &mut || false).unwrap());
+        assert_eq!(one.now(), began + Duration::from_secs(2), "time passes while klippy waits");
+        assert!(matches!(one.run(began + Duration::from_secs(100), &mut || false), Err(Stop::Ended)));
+        let seen = player.join().unwrap();
+        let [(answered_ns, 1, answer), waited, last] = seen[..] else { panic!("{seen:?}") };
+        assert!(answered_ns < 1000 && answer > 40, "{seen:?}");
+        assert_eq!((waited, last), ((4_000_000_000, 0, 0), (1_000_000, 0, 0)));
+        assert!(matches!(one.run(began + Duration::from_secs(200), &mut || false), Err(Stop::Ended)));
+    }
+
+    #[test]
+    fn a_pace_is_kept_and_what_is_lost_is_not_caught_up() {
+        let ago = |s: u64| Instant::now().checked_sub(Duration::from_secs(s)).unwrap();
+        let mut pace = Pace { speed: 2.0, from: (ago(10), 1_000_000_000) };
+        // 20 s are over, and the printer is there.
+        let until_ns = pace.until_ns(21_000_000_000);
+        assert!((21_000_000_000..21_100_000_000).contains(&until_ns), "{until_ns}");
+        // It is 19 s behind: it may catch up a tenth of a second.
+        let mut pace = Pace { speed: 2.0, from: (ago(10), 1_000_000_000) };
+        assert_eq!(pace.until_ns(2_000_000_000), 2_100_000_000);
+        assert!(pace.until_ns(2_100_000_000) <= 2_200_000_000);
+    }
+}
