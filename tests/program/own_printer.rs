@@ -48,7 +48,7 @@ fn a_printer_cfg_is_served_and_klippy_gets_a_copy() {
 
 #[test]
 fn a_mistake_is_one_line_with_its_place_in_klippys_words() {
-    for mistake in MISTAKES {
+    for mistake in MISTAKES.iter().filter(|mistake| !mistake.is_klippys) {
         let (_home, cfg) = folder_with("printer.cfg", &mistake.text());
         let (status, out, log) = output(&["sim", cfg.to_str().unwrap(), "--print-board"]);
         assert_eq!((status, out.as_str()), (Some(1), ""), "{mistake:?}: {log}");
@@ -61,7 +61,7 @@ fn a_mistake_is_one_line_with_its_place_in_klippys_words() {
 
 #[test]
 fn a_try_reports_a_mistake_that_is_found_before_klippy_starts() {
-    let mistake = MISTAKES[MISTAKES.len() / 2];
+    let mistake = MISTAKES.iter().rfind(|mistake| !mistake.is_klippys).unwrap();
     let (_home, cfg) = folder_with("printer.cfg", &mistake.text());
     let cfg = cfg.to_str().unwrap();
     let (status, out, log) = output(&["sim", cfg, "--try", "--klipper", "/nonexistent", "--json"]);

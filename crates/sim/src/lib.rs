@@ -53,7 +53,7 @@ pub use part::pwm_channel::PwmChannelConfig;
 pub use part::servo::ServoConfig;
 pub use part::spi_dac::{SpiDacChip, SpiDacConfig};
 pub use part::spool::SpoolConfig;
-pub use part::ssd1306::Ssd1306Config;
+pub use part::ssd1306::{DisplayChip, Ssd1306Config};
 pub use part::thermocouple::{Converter, SensorFault, ThermocoupleConfig};
 pub use part::tmc2209::{Tmc2208Config, Tmc2209Config, UartDriverConfig};
 pub use part::tmc2660::Tmc2660Config;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The options for a printer.cfg of one's own.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
@@ -33,11 +33,12 @@ pub(crate) struct OwnArgs {
     /// Draw speed, temperatures and flow of --print into this file
     #[arg(long, value_name = "FILE.svg", requires = "print")]
     plot: Option<PathBuf>,
-    /// The checkout of Klipper or Kalico for --try and --print; KLIPPER_DIR by default
+    /// The checkout of Klipper or Kalico that judges printer.cfg, and for --try and --print; KLIPPER_DIR by default, or
+    /// the one of this computer's klippy
     #[arg(long, value_name = "DIR")]
     klipper: Option<PathBuf>,
     /// The Python for that klippy; KLIPPER_PYTHON, or ~/klippy-env, by default
-    #[arg(long, value_name = "PROGRAM", requires = "with_klippy")]
+    #[arg(long, value_name = "PROGRAM")]
     python: Option<PathBuf>,
     /// Print this file in --try, in place of a small square
     #[arg(long, value_name = "FILE", requires = "attempt")]
@@ -106,9 +107,14 @@ impl OwnArgs {
         if self.json { Form::Json } else { Form::Lines }
     }
 
-    /// The klippy that is named, or the one of KLIPPER_DIR.
+    /// The klippy that is named, the one of KLIPPER_DIR, or the only one that this computer has.
     pub(crate) fn klipper(&self) -> Option<PathBuf> {
-        self.klipper.clone().or_else(|| std::env::var_os("KLIPPER_DIR").map(PathBuf::from))
+        let named = || self.klipper.clone().or_else(|| std::env::var_os("KLIPPER_DIR").map(PathBuf::from));
+        named().or_else(pinion::cli::klipper_here)
+    }
+
+    pub(super) fn python(&self) -> Option<&Path> {
+        self.python.as_deref()
     }
 
     /// The options of `--try` or `--print`, if one is given.
