@@ -207,6 +207,9 @@ impl OneClock {
             return Err(Stop::Ended);
         }
         loop {
+            if self.ended.load(Ordering::Relaxed) {
+                return Err(Stop::Asked);
+            }
             let player_ns = self.player.as_ref().map_or(u64::MAX, |player| player.until_ns);
             if self.player.is_some() && (self.has_news || self.now_ns >= player_ns) {
                 self.pass_turn()?;
@@ -227,9 +230,6 @@ impl OneClock {
             if let Some(pace) = &mut self.pace {
                 let paced_ns = pace.until_ns(self.now_ns);
                 if paced_ns <= self.now_ns {
-                    if self.ended.load(Ordering::SeqCst) {
-                        return Err(Stop::Asked);
-                    }
                     std::thread::sleep(OUTSIDE);
                     self.has_news = true;
                     continue;
