@@ -150,9 +150,11 @@ SUITES ?= bookworm trixie
 test-bare:
 	@for suite in $(SUITES); do scripts/bare $$suite || exit 1; done
 
-# Such as '--skip page' or 'upgrade' (docs/develop/test-package.md).
+# Such as 'service/ installation/' or 'upgrade' (docs/develop/test-package.md).
 CHECKS ?=
 test-package: system-packages-system
+	@# pinion-sim is in the package, too.
+	'$(CARGO)' test --locked --no-run --test package --test pinion_sim
 	'$(CARGO)' test --locked --test package -- $(CHECKS)
 
 SECONDS ?= 86400

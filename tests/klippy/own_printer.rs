@@ -79,7 +79,7 @@ fn a_printer_of_two_boards_is_leveled_and_prints() {
 fn printers_of_the_kind_that_users_have_pass_every_step() {
     let Some(checkout) = checkout("printers_of_the_kind_that_users_have_pass_every_step") else { return };
     let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kit/printers");
-    for (name, count) in [("voron-2.4", 11), ("ender-3", 9), ("mk3", 8), ("ratrig", 12), ("kossel", 8), ("idex", 7)] {
+    for (name, count) in [("voron-2.4", 11), ("ender-3", 10), ("mk3", 9), ("ratrig", 12), ("kossel", 9), ("idex", 8)] {
         let (passed, steps) = tried(&checkout, &printers.join(format!("{name}.cfg")), &[]);
         assert!(passed, "{name}: {steps:?}");
         let tried = steps.iter().filter(|step| step["result"] == "passed").count();
@@ -233,5 +233,61 @@ fn a_change_that_does_not_fit_the_printer_fails() {
         // Kalico names the rail without "stepper_".
         let words = if is_kalico(&checkout) { words.replace("stepper_", "") } else { words.to_owned() };
         assert!(failed["text"].as_str().unwrap().contains(&words), "{to}: {failed}");
+    }
+}
+
+/// A print of a file on the built-in printer: whether it passed, and its report.
+fn printed(checkout: &Path, gcode: &str) -> Value {
+    let home = tempfile::tempdir().unwrap();
+    // Of root's print, another user runs everything.
+    let _ = fs::set_permissions(home.path(), fs::Permissions::from_mode(0o777));
+    let place = |name: &str| home.path().join(name);
+    let config = Command::new(pinion_path()).args(["sim", "--print-config"]).output().unwrap().stdout;
+    fs::write(place("printer.cfg"), [config, b"[pause_resume]\n".to_vec()].concat()).unwrap();
+    fs::write(place("a.gcode"), gcode).unwrap();
+    let mut command = Command::new(pinion_path());
+    command.arg("sim").arg(place("printer.cfg")).arg("--print").arg(place("a.gcode")).arg("--json");
+    command.arg("--klipper").arg(checkout).args(["--python", &python(), "--plot"]).arg(place("plot.svg"));
+    let done = command.output().unwrap();
+    let log = String::from_utf8_lossy(&done.stderr);
+    let mut report: Value = serde_json::from_slice(&done.stdout).unwrap_or_else(|error| panic!("{error}\n{log}"));
+    assert_eq!(done.status.success(), report["passed"] == true, "{report}");
+    assert!(fs::read_to_string(place("plot.svg")).unwrap().contains("extruder"));
+    for key in ["folder", "printer", "real_seconds"] {
+        report.as_object_mut().unwrap().remove(key);
+    }
+    report
+}
+
+#[test]
+fn a_file_is_printed_and_each_time_the_same() {
+    let Some(checkout) = checkout("a_file_is_printed_and_each_time_the_same") else { return };
+    let gcode = "M104 S200\nG28\nM109 S200\nM83\nG1 X50 Y50 Z0.2 F6000\nG1 X90 E2 F1200\nPAUSE\nG1 Y90 E2\n\
+                 G1 Z0.4\nG1 X50 E2\nG1 Y50 E2\nM104 S0\n";
+    let report = printed(&checkout, gcode);
+    assert_eq!((&report["passed"], &report["pauses"]), (&true.into(), &1.into()), "{report}");
+    assert_eq!(report["layers"].as_array().unwrap().len(), 2, "{report}");
+    assert!((report["filament_mm"].as_f64().unwrap() - 8.0).abs() < 0.2, "{report}");
+    assert!(report["phases"]["heating"].as_f64().unwrap() > 10.0, "{report}");
+    assert!(report["phases"]["paused"].as_f64().unwrap() > 25.0, "{report}");
+    let x = report["motors"].as_array().unwrap().iter().find(|motor| motor["name"] == "x").unwrap();
+    assert!((x["mm_per_s"].as_f64().unwrap() - 20.0).abs() < 2.0, "{x}");
+    assert_eq!(printed(&checkout, gcode), report);
+}
+
+#[test]
+fn a_print_that_stops_says_at_which_line() {
+    let Some(checkout) = checkout("a_print_that_stops_says_at_which_line") else { return };
+    for (gcode, line, why) in [
+        ("G28\n; cold\nG1 X50 E2\nM400\n", 3, "Extrude below minimum temp"),
+        ("G28\nG1 X5000\n", 2, "Move out of range"),
+        ("G28\nM112\n", 2, "Shutdown due to M112 command"),
+        ("TEMPERATURE_WAIT SENSOR=extruder MINIMUM=100\n", 1, "nothing has moved for 60 min"),
+    ] {
+        let report = printed(&checkout, gcode);
+        let stopped = &report["stopped"];
+        assert_eq!(stopped["line"], line, "{report}");
+        assert!(stopped["why"].as_str().unwrap().contains(why), "{report}");
+        assert_eq!(report["passed"], false);
     }
 }

@@ -38,11 +38,6 @@ fn tried(check: &Check) -> impl Iterator<Item = &str> {
     check.script.lines().filter_map(|line| line.strip_prefix(WORD))
 }
 
-/// Whether the check tries pages.
-pub fn tries_any(check: &Check) -> bool {
-    tried(check).next().is_some()
-}
-
 /// The checks. The check for any page is repeated for each page without another check.
 ///
 /// # Errors

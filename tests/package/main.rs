@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The package, installed in a Debian 12 that was booted with systemd in the emulator. It runs the scripts of
-//! `tests/package/checks` in order. Some of them try the commands of the pages. docs/develop/test-package.md explains
-//! its use.
+//! `tests/package/checks`: those of the folders `service` and `installation` in order, each folder in a VM of its own, and
+//! those of `pages`, which try the commands of the pages. docs/develop/test-package.md explains its use.
 //!
 //! This is the computer's side, a separate test harness.
 
@@ -26,8 +26,9 @@ const USAGE: &str = "\
 Usage: cargo test --test package -- [OPTIONS] [FILTERS...]
 
 Installs the package in a booted Debian 12 and runs the checks whose name contains any of the filters,
-as in reboot; before any but those of the pages the first one, which installs it. It takes root, installs the
-emulator if it is missing, and downloads a Debian the first time.
+as in reboot or service/. The first check of service/ and of installation/ installs the package for the
+others of its folder, so it runs before each of them. It takes root, installs the emulator if it is missing,
+and downloads a Debian the first time.
 
 Options:
   --exact            A filter is a whole name
@@ -38,8 +39,12 @@ Options:
 
 /// Exit status of a check that cannot run. The check prints the reason.
 const NOT_RUN: i32 = 78;
-/// The first check installs the package for all later checks.
-const INSTALLS: &str = "10-install";
+/// The folder of the checks of the installed service: they run in order, and the first one installs the package.
+const SERVICE: &str = "service";
+/// The folder of the checks that install, upgrade and remove the package, and boot: as the former.
+const INSTALLATION: &str = "installation";
+/// The folder of the checks that try pages. Each makes everything that its page needs.
+const PAGES: &str = "pages";
 /// How long the prints of the checks last, in minutes. Without this they are short.
 const MINUTES: &str = "PINION_PRINT_MINUTES";
 const SHORT_PRINT: Duration = Duration::from_secs(10);
@@ -85,28 +90,37 @@ fn long_print() -> Result<Option<Duration>, String> {
     minutes.map(|minutes| Some(Duration::from_secs(60 * minutes))).ok_or_else(|| format!("{MINUTES} is no number"))
 }
 
-/// The scripts in the order of their numbers, each after the common script.
-fn checks(long_print: Option<Duration>) -> Result<Vec<Check>, String> {
+/// The scripts of a folder in the order of their numbers, each after the common script.
+fn checks(folder: &str, long_print: Option<Duration>) -> Result<Vec<Check>, String> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
     let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
     let print_s = long_print.unwrap_or(SHORT_PRINT).as_secs();
     let shared = read(&here.join("guest/words.sh"))?;
-    let folder = here.join("checks");
-    let entries = fs::read_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let path = here.join("checks").join(folder);
+    let entries = fs::read_dir(&path).map_err(|error| format!("{}: {error}", path.display()))?;
     let mut paths: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
     paths.sort();
     let check = |path: &PathBuf| {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let name = format!("{folder}/{}", path.file_stem().unwrap_or_default().to_string_lossy());
         Ok(Check { name, script: format!("PRINT_S={print_s}\n{shared}\n{}", read(path)?) })
     };
-    commands::each_page(paths.iter().map(check).collect::<Result<_, String>>()?)
+    paths.iter().map(check).collect()
 }
 
 fn run(options: &Options) -> Result<bool, String> {
     let long_print = long_print()?;
-    let checks = checks(long_print)?;
+    let chosen = |folder, is_needed: bool| {
+        let checks = checks(folder, long_print)?;
+        let is_needed = is_needed || checks.iter().any(|check| options.chosen(check));
+        let runs = |(n, check): &(usize, Check)| options.chosen(check) || is_needed && *n == 0;
+        Ok::<_, String>(checks.into_iter().enumerate().filter(runs).map(|(_, check)| check).collect::<Vec<Check>>())
+    };
+    // A script of `--run` finds the installed package.
+    let (service, installation) = (chosen(SERVICE, options.run.is_some())?, chosen(INSTALLATION, false)?);
+    let mut of_pages = commands::each_page(checks(PAGES, long_print)?)?;
+    of_pages.retain(|check| options.chosen(check));
     if options.list {
-        checks.iter().filter(|check| options.chosen(check)).for_each(|check| println!("{}: test", check.name));
+        service.iter().chain(&installation).chain(&of_pages).for_each(|check| println!("{}: test", check.name));
         return Ok(true);
     }
     if !nix::unistd::geteuid().is_root() {
@@ -119,16 +133,12 @@ fn run(options: &Options) -> Result<bool, String> {
     let share = folder.path().join("share");
     packages::share(&share)?;
     packages::share_klippy(&share)?;
-    if checks.iter().any(|check| options.chosen(check) && check.script.contains("/share/apt")) {
+    if installation.iter().any(|check| check.script.contains("/share/apt")) {
         packages::share_repositories(&share)?;
     }
     commands::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
-    // Each check of pages makes everything that its page needs. So a second VM runs these checks in parallel. The first
-    // VM helps when its own checks are done.
-    let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(commands::tries_any);
-    of_pages.retain(|check| options.chosen(check));
     of_pages.retain(|check| {
         let has_nothing = commands::has_nothing_to_try(check);
         if has_nothing {
@@ -136,18 +146,14 @@ fn run(options: &Options) -> Result<bool, String> {
         }
         !has_nothing
     });
-    if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
-        others.retain(|check| check.name == INSTALLS || options.chosen(check));
-    } else {
-        others.clear();
-    }
+    // Both VMs help with the pages when their own checks are done.
     let of_pages = Mutex::new(VecDeque::from(of_pages));
-    let vms = [("first", others, options.run.as_deref()), ("second", Vec::new(), None)];
     let run = |(name, checks, then): (&str, Vec<Check>, _)| {
         let folder = folder.path().join(name);
         fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
         in_a_vm(|| Vm::boot(&root, &folder, &share, long_print), checks, &of_pages, options, then)
     };
+    let vms = [(SERVICE, service, options.run.as_deref()), (INSTALLATION, installation, None)];
     let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
         let started = vms.map(|vm| scope.spawn(|| run(vm)));
         started.into_iter().map(|thread| thread.join().unwrap_or_else(|_| Err("a VM's thread died".into()))).collect()
@@ -177,7 +183,7 @@ struct Tally {
 }
 
 /// Runs the checks in a VM, if there are any, and `then` the script at this path. It also runs the shared checks that
-/// the other VMs leave.
+/// the other VM leaves.
 fn in_a_vm(
     boot: impl FnOnce() -> Result<Vm, String>,
     checks: Vec<Check>,
@@ -188,6 +194,7 @@ fn in_a_vm(
     let mut tally = Tally::default();
     let next_shared = || shared.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
     let mut own = VecDeque::from(checks);
+    let installs = own.front().map(|check| check.name.clone());
     if own.is_empty() && then.is_none() {
         own.extend(next_shared());
     }
@@ -216,7 +223,7 @@ fn in_a_vm(
             0 => tally.passed += 1,
             _ => tally.failed.push(check.name.clone()),
         }
-        if status != 0 && check.name == INSTALLS {
+        if status != 0 && installs.as_ref() == Some(&check.name) {
             break;
         }
     }

@@ -292,10 +292,10 @@ fn a_request_that_comes_letter_by_letter_is_given_up() {
     }
 }
 
-/// Each may wait for a minute, and they take more places than there are.
+/// Each may wait for longer than the picture's client, and they take more places than there are.
 #[test]
 fn slow_clients_keep_no_place_that_another_client_needs() {
-    let camera = Camera::start();
+    let camera = Camera::start_at("127.0.0.1:0", Limits { request: 10 * WAIT_MAX, ..Limits::default() });
     let slow: Vec<TcpStream> = (0..150).map(|_| camera.sent("GET /snap")).collect();
     assert_jpeg(&camera.get("/snapshot").1);
     drop(slow);

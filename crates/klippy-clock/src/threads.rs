@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::ffi::c_void;
+use std::ops::{Deref, DerefMut};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -72,15 +73,42 @@ const READINGS_MAX: u32 = 256;
 thread_local! {
     static ME: Cell<usize> = const { Cell::new(NONE) };
     static READINGS: Cell<u32> = const { Cell::new(0) };
+    /// This thread changes the table. A library for memory that is loaded, too, may use locks for what that needs.
+    static CHANGES: Cell<bool> = const { Cell::new(false) };
 }
 
 /// Whether the calling thread takes turns.
 pub(crate) fn is_one() -> bool {
-    turns::is_on() && ME.try_with(Cell::get).unwrap_or(NONE) != NONE
+    turns::is_on() && ME.get() != NONE && !CHANGES.get()
 }
 
-fn lock() -> MutexGuard<'static, Threads> {
-    THREADS.lock().unwrap_or_else(PoisonError::into_inner)
+/// The table of threads, for the time of a change.
+struct Table(MutexGuard<'static, Threads>);
+
+impl Deref for Table {
+    type Target = Threads;
+
+    fn deref(&self) -> &Threads {
+        &self.0
+    }
+}
+
+impl DerefMut for Table {
+    fn deref_mut(&mut self) -> &mut Threads {
+        &mut self.0
+    }
+}
+
+impl Drop for Table {
+    fn drop(&mut self) {
+        CHANGES.set(false);
+    }
+}
+
+fn lock() -> Table {
+    let table = THREADS.lock().unwrap_or_else(PoisonError::into_inner);
+    CHANGES.set(true);
+    Table(table)
 }
 
 impl Threads {
@@ -218,7 +246,7 @@ pub(crate) fn yield_token() {
     go_on(me, threads);
 }
 
-fn go_on(me: usize, mut threads: MutexGuard<'static, Threads>) -> Woken {
+fn go_on(me: usize, mut threads: Table) -> Woken {
     // SAFETY: the address of this thread's error number, which callers may still want.
     let error = unsafe { libc::__errno_location() };
     // SAFETY: the same.
@@ -243,7 +271,7 @@ pub(crate) fn has_read() {
 
 /// Lets the first `most` threads that wait for an address go on, when their turn comes.
 pub(crate) fn wake(address: usize, most: usize) {
-    if AT_ADDRESSES.load(Ordering::Relaxed) == 0 || !turns::is_on() {
+    if AT_ADDRESSES.load(Ordering::Relaxed) == 0 || !turns::is_on() || CHANGES.get() {
         return;
     }
     let mut threads = lock();

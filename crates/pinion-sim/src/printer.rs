@@ -253,8 +253,11 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
 /// Tries a printer whose klippy has the printer's clock, or prints on it, or serves it.
 fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
     let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
+    let ended = match asked_to_end() {
+        Ok(ended) => ended,
+        Err(error) => return failed(error),
+    };
     let tried = || {
-        let ended = asked_to_end()?;
         let clock = clock::clock();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
@@ -267,7 +270,7 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
         attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
         let time = Time::One(Box::new(one));
         let done = match &attempt.print {
-            Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time)?,
+            Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
             None if attempt.speed.is_some() => {
                 attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?
             }
@@ -282,6 +285,7 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
     match tried() {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
+        Err(_) if ended.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Err(trouble) => failed(trouble),
     }
 }

@@ -31,6 +31,7 @@ is_active() { systemctl --quiet is-active "$1"; }
 fresh() { systemctl reset-failed 'pinion-mcu*' 'klipper-mcu*' 2>/dev/null || true; }
 # Starts the service, if it does not run, and a host that lights the heater.
 light() {
+    dark
     fresh
     systemctl start pinion-mcu
     klippy /share/host light $LINK HEATER >/run/light 2>&1 &
@@ -38,6 +39,9 @@ light() {
     until_true 5 is_high 3
 }
 dark() { pkill -f '/share/host light' || true; }
+# The newest recording. The heater's host is gone, so the MCU stops and leaves one.
+recording() { find /var/lib/pinion -name '*.trace' -newer /run/light | head -n 1; }
+leaves_recording() { [ -n "$(recording)" ]; }
 # The journal of the service since the mark that `mark` sets.
 # (Not by a cursor: with a filter, journalctl --after-cursor omits the first line that the filter passes.)
 mark() { date +@%s.%6N >/run/mark; }

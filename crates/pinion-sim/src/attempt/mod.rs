@@ -65,6 +65,7 @@ pub(crate) fn run(
     let host = match Host::start(attempt, folder, probe, time) {
         Ok(host) => host,
         Err(NoStart::Alone) => return None,
+        Err(_) if ended.load(Ordering::SeqCst) => return Some(false),
         Err(NoStart::Trouble(trouble)) => {
             report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, Duration::ZERO);
             report.end(printer, Some(&folder.path));
@@ -86,17 +87,23 @@ pub(crate) fn run(
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
             None => trial.tried(step),
         };
+        if ended.load(Ordering::SeqCst) {
+            break;
+        }
         if outcome.is_failure() {
             trial.recover(step.name);
         }
         report.add(step.name, outcome, trial.host.now().saturating_sub(since));
+    }
+    if ended.load(Ordering::SeqCst) {
+        return Some(false);
     }
     if let Err(trouble) = trial.keep() {
         log::warn!("{trouble}");
     }
     drop(trial);
     report.end(printer, Some(&folder.path));
-    Some(report.passed() && !ended.load(Ordering::SeqCst))
+    Some(report.passed())
 }
 
 /// Reports a mistake that is found before klippy starts.

@@ -17,6 +17,8 @@ use pinion_sim::SimBoard;
 
 use super::workers::Buses;
 
+/// Highest number of bytes that wait for an MCU that is busy.
+const INPUT_BYTES_MAX: usize = 1 << 16;
 /// Highest number of bytes for a klippy that does not read.
 const OUTPUT_BYTES_MAX: usize = 1 << 20;
 
@@ -124,13 +126,13 @@ impl BoardMcu {
         }
         let Some(connection) = &mut self.connection else { return };
         let mut piece = [0; 4096];
-        loop {
+        while connection.input.len() < INPUT_BYTES_MAX {
             match connection.stream.read(&mut piece) {
-                Ok(0) => break self.connection = None,
+                Ok(0) => return self.connection = None,
                 Ok(read) => connection.input.extend_from_slice(&piece[..read]),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
-                Err(_) => break self.connection = None,
+                Err(_) => return self.connection = None,
             }
         }
     }

@@ -40,6 +40,8 @@ const HELLO: &[u8; 8] = b"pinion1\0";
 const LOAD: Duration = Duration::from_secs(20);
 /// How long, in real time, klippy may compute until it waits for something.
 const COMPUTE: Duration = Duration::from_secs(120);
+/// How far klippy's readings of the clock may move it in a turn.
+const READINGS_NS_MAX: u64 = 10_000_000_000;
 /// Real time between two looks whether the program shall end.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -207,6 +209,9 @@ impl OneClock {
             return Err(Stop::Ended);
         }
         loop {
+            if self.ended.load(Ordering::Relaxed) {
+                return Err(Stop::Asked);
+            }
             let player_ns = self.player.as_ref().map_or(u64::MAX, |player| player.until_ns);
             if self.player.is_some() && (self.has_news || self.now_ns >= player_ns) {
                 self.pass_turn()?;
@@ -227,9 +232,6 @@ impl OneClock {
             if let Some(pace) = &mut self.pace {
                 let paced_ns = pace.until_ns(self.now_ns);
                 if paced_ns <= self.now_ns {
-                    if self.ended.load(Ordering::SeqCst) {
-                        return Err(Stop::Asked);
-                    }
                     std::thread::sleep(OUTSIDE);
                     self.has_news = true;
                     continue;
@@ -284,7 +286,8 @@ impl OneClock {
             }
         }
         let word = |at: usize| u64::from_le_bytes(turn[at..at + 8].try_into().unwrap_or_default());
-        self.now_ns = self.now_ns.max(word(0));
+        // Each reading of the clock takes it some nanoseconds. A printer.cfg is a program, which may say anything.
+        self.now_ns = word(0).clamp(self.now_ns, self.now_ns + READINGS_NS_MAX);
         set(&self.clock, self.now_ns);
         if let Some(player) = &mut self.player {
             player.until_ns = word(8);

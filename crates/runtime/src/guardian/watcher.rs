@@ -46,7 +46,8 @@ pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
     let kept = [0, 1, 2, socket.as_raw_fd()].into_iter().chain(program.pidfd.as_ref().map(AsRawFd::as_raw_fd));
     forked::settle(NAME, &kept.collect::<Vec<_>>());
     // Failures are ignored here: without any of these the guardian can still do its work.
-    // When memory is short, the kernel now kills other processes first. Only root may ask for this.
+    // When memory is short, the kernel now kills other processes only. Root may ask for this, and a service that starts
+    // with this score.
     let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
     let _ = sys::keep_only(sys::SERVE);
     if realtime {

@@ -3,6 +3,7 @@
 //! threads, because a process with threads cannot be forked.
 
 use std::ffi::CStr;
+use std::fs;
 
 use log::warn;
 
@@ -12,6 +13,10 @@ use pinion_linux::sys;
 use crate::guardian::{self, Guardian};
 use crate::host::search::{self, HostSearch};
 use crate::recorder::Recording;
+
+/// When memory is short, the kernel kills the program before the guardian, and after every other process. The memory of
+/// a killed program is locked and does not become free at once, so the kernel would kill the guardian, too.
+const OOM_SCORE: i32 = -900;
 
 /// The kernel's names of these processes. Their command lines are the program's.
 pub const NAMES: [&CStr; 2] = [guardian::NAME, search::NAME];
@@ -36,11 +41,21 @@ impl Helpers {
         // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
         let guardian = guarded.then(|| Guardian::start(recording)).transpose()?;
+        rank_before_guardian();
         if let Err(error) = sys::keep_only(rights) {
             warn!(
                 "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion keeps more rights than it needs"
             );
         }
         Ok(Helpers { guardian, search })
+    }
+}
+
+/// The service starts with the guardian's score, because only root may lower one. Without the service nothing changes.
+fn rank_before_guardian() {
+    const SCORE: &str = "/proc/self/oom_score_adj";
+    let score = fs::read_to_string(SCORE).ok().and_then(|score| score.trim().parse::<i32>().ok());
+    if score.is_some_and(|score| score < OOM_SCORE) {
+        let _ = fs::write(SCORE, OOM_SCORE.to_string());
     }
 }

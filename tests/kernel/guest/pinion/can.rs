@@ -15,8 +15,8 @@ use pinion_client::serial::{BlockLink, Port};
 use pinion_client::{Client, Error};
 use pinion_protocol::block::{Sequence, frame};
 use socketcan::{
-    CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame as _,
-    ExtendedId, Frame as _, Socket as _, StandardId,
+    CanDataFrame, CanErrorFrame, CanFdFrame, CanFdSocket, CanFilter, CanFrame, CanRemoteFrame, CanSocket,
+    EmbeddedFrame as _, ExtendedId, Frame as _, Socket as _, SocketOptions as _, StandardId,
 };
 
 use crate::gpio_sim::GpioSim;
@@ -101,6 +101,8 @@ impl Host {
 
     fn try_connect(faults: bool, wait: Duration) -> Result<(Host, Client), Error> {
         let bus = bus();
+        // Frames of others take no room in its buffer.
+        bus.set_filters(&[CanFilter::new(u32::from(HOST_ID) + 1, libc::CAN_SFF_MASK)]).expect("a socket");
         assign(&bus, UUID_BYTES, NODE_ID);
         let (ours, mut theirs) = UnixStream::pair().expect("sockets");
         theirs.set_nonblocking(true).expect("a socket");
@@ -280,6 +282,80 @@ fn another_node_with_the_same_nodeid_stops_the_mcu() {
     // The host finds it again, and hears why.
     assign(&bus(), UUID_BYTES, NODE_ID);
     assert!(client.status().expect("an answer").is_shutdown);
+}
+
+/// A heater with pulses, which its host has to refresh within half a second.
+const HEATER: [&str; 2] = [
+    "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=25000000",
+    "set_digital_out_pwm_cycle oid=0 cycle_ticks=500000",
+];
+
+fn heat(client: &mut Client) {
+    let at = client.clock_in(0.02).expect("the clock").wire();
+    run(client, &format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
+}
+
+#[test]
+fn a_second_host_that_assigns_another_nodeid_leaves_no_heater_on() {
+    let _interface = Interface::new();
+    let sim = GpioSim::new("lab", 8);
+    let program = start();
+    let (host, mut client) = Host::connect(false);
+    configure(&mut client, 1, &HEATER);
+    heat(&mut client);
+    sysfs::wait_until("the heater is on", || sim.level(1));
+    // The node now listens to the second host, and the first one refreshes in vain, each time for 0.2 s later.
+    let first = client.clock_in(0.02).expect("the clock").wire();
+    assign(&bus(), UUID_BYTES, NODE_ID + 1);
+    for round in 1..=10 {
+        let at = first.wrapping_add(round * 10_000_000);
+        let _ = client.send_line(&format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
+        thread::sleep(Duration::from_millis(200));
+    }
+    assert!(!sim.level(1));
+    let log = program.log();
+    assert!(log.contains("Missed scheduling of next digital out event"), "{log}");
+    drop((host, client));
+    // The first one assigns its own again, and hears why.
+    let (_host, mut client) = Host::connect(false);
+    assert!(client.status().expect("an answer").is_shutdown);
+}
+
+#[test]
+fn a_heater_stays_on_beside_nodes_that_fill_the_bus_and_errors_of_its_interface() {
+    let _interface = Interface::new();
+    let sim = GpioSim::new("lab", 8);
+    let program = start();
+    let (_host, mut client) = Host::connect(false);
+    configure(&mut client, 1, &HEATER);
+    heat(&mut client);
+    sysfs::wait_until("the heater is on", || sim.level(1));
+    // As many frames as a bus of 1 Mbit/s carries.
+    let flood = Flood::start(|bus, round| {
+        for count in 0..64 {
+            let id = HOST_ID + 2 + (round.wrapping_mul(64) + count) as u16 % 0xf0;
+            throw_data(bus, id, &[0x7e; 8]);
+        }
+        throw_data(bus, ADMIN, &[1, 9, 9, 9, 9, 9, 9, NODE_ID + 1]);
+        // Off the bus, and back.
+        for bits in [libc::CAN_ERR_BUSOFF, libc::CAN_ERR_RESTARTED] {
+            throw(bus, CanErrorFrame::new_error(bits, &[0; 8]).expect("eight bytes"));
+        }
+        thread::sleep(Duration::from_millis(8));
+    });
+    for _ in 0..10 {
+        thread::sleep(Duration::from_millis(200));
+        heat(&mut client);
+    }
+    client.check().expect("no shutdown");
+    sysfs::wait_until("the heater is on", || sim.level(1));
+    let rounds = flood.end();
+    assert!(rounds > 100, "{rounds} rounds are no flood");
+    let status = client.query("get_canbus_status", &[], "canbus_status", None).expect("an answer");
+    assert_eq!(status.text("canbus_bus_state").expect("a name"), "active");
+    let log = program.log();
+    assert!(log.contains("is off the bus after too many errors"), "{log}");
+    assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
 }
 
 #[test]

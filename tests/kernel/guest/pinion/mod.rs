@@ -28,4 +28,5 @@ mod serial;
 mod spi;
 mod steps;
 mod tmcuart;
+mod wall_clock;
 mod watchdog;

@@ -9,6 +9,7 @@ mod report;
 use std::fs;
 use std::io::{BufReader, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use pinion::cli::files::Output;
@@ -78,6 +79,7 @@ pub(crate) fn run(
     folder: &Folder,
     probe: &SimProbe,
     time: Time,
+    ended: &AtomicBool,
 ) -> Result<Option<bool>, Trouble> {
     let plot = options.plot.as_deref().map(|path| Output::check(path, &[printer, &options.file])).transpose();
     let plot = plot.map_err(Trouble::new)?;
@@ -101,12 +103,15 @@ pub(crate) fn run(
     };
     let printed = printing.run();
     let took = began.elapsed();
+    printing.host.progress.end();
+    if ended.load(Ordering::SeqCst) {
+        return Ok(Some(false));
+    }
     if let Some(plot) = plot {
         let names: Vec<String> = printing.heaters.iter().map(|heater| heater.name.clone()).collect();
         let drawing = plot::svg(&printing.samples, &names);
         plot.write(|out| out.write_all(drawing.as_bytes())).map_err(Trouble::new)?;
     }
-    printing.host.progress.end();
     let page = match attempt.form {
         Form::Json => Page::json(&format!("{}\n", printed.json(printer, (took, &folder.path)))),
         Form::Lines => printed.page(printer, (took, options.layers)),
@@ -216,13 +221,13 @@ impl Print<'_> {
             let more = ["print_stats", "virtual_sdcard", "toolhead", "motion_report", "webhooks"];
             let objects: Vec<&str> = heaters.iter().map(String::as_str).chain(more).collect();
             let status = self.host.query(&objects).map_err(|refused| refused.to_string())?;
-            if status["webhooks"]["state"] != "ready" {
-                return Err(first_line(status["webhooks"]["state_message"].as_str().unwrap_or_default()));
-            }
             let offset = status["virtual_sdcard"]["file_position"].as_u64().unwrap_or_default();
             let state = status["print_stats"]["state"].as_str().unwrap_or_default().to_owned();
             if state != "complete" {
                 self.line = self.file.line_at(offset);
+            }
+            if status["webhooks"]["state"] != "ready" {
+                return Err(first_line(status["webhooks"]["state_message"].as_str().unwrap_or_default()));
             }
             self.see(&status, began, &state);
             match state.as_str() {

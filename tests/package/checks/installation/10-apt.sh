@@ -1,5 +1,7 @@
 # The apt repository of a release: added by its four lines, installed, and upgraded while the service serves. A file that
 # somebody has changed is refused.
+systemctl is-system-running --wait || true
+until_true 30 is_active test-chips
 export DEBIAN_FRONTEND=noninteractive
 APT=/srv/pinion-apt
 # serve FOLDER: the repository's files are now these.
@@ -12,7 +14,6 @@ refused() {
 }
 version() { dpkg-query -W -f '${Version}' pinion-mcu; }
 
-apt-get -qq purge -y pinion-mcu pinion-sim
 serve /share/apt
 is "$(wc -l <$APT/pinion.sources)" 4 "the number of lines"
 grep -q '^Signed-By: /etc/apt/keyrings/pinion.asc$' $APT/pinion.sources
@@ -60,6 +61,8 @@ refused 'not signed|no longer signed' apt-get update -o APT::Update::Error-Mode=
 
 rm -r /etc/apt/sources.list.d/pinion.sources /etc/apt/keyrings/pinion.asc $APT
 apt-get -qq update
-# The next checks need the package as delivered.
+# The next checks need the package as delivered, and another instance, whose configuration is its owner's.
 apt-get install -y --allow-downgrades /share/pinion-mcu.deb /share/pinion-sim.deb
 systemctl restart pinion-mcu
+echo 'board = "sim"' >/etc/pinion/second.toml
+systemctl enable --now pinion-mcu@second

@@ -1,4 +1,6 @@
 # Without a package: make install, and make uninstall.
+rm -f /etc/pinion/second.toml
+dpkg -P pinion-mcu pinion-sim
 cp -r /share/tree /root/tree
 cd /root/tree
 apt-get install -y libiio0 >/dev/null

@@ -10,4 +10,4 @@ identifies $LINK HEATER
 systemctl stop pinion-mcu@second
 [ ! -L /tmp/klipper_host_second ]
 identifies
-systemctl enable --now pinion-mcu@second
+rm /etc/pinion/second.toml
