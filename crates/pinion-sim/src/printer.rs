@@ -159,7 +159,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     if let Some((owner, attempt)) = owner.as_ref().and_then(|owner| Some((owner, owner.attempt.as_ref()?)))
         && !attempt.real_time
     {
-        return run_in_one_clock(args, owner, attempt, config);
+        return run_in_one_clock(args, owner, attempt, config, (path, spi_trace));
     }
     let links = match &owner {
         Some(owner) => owner.place.links().to_vec(),
@@ -251,12 +251,19 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
 }
 
 /// Tries a printer whose klippy has the printer's clock, or prints on it, or serves it.
-fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
+fn run_in_one_clock(
+    args: &SimArgs,
+    owner: &Owner,
+    attempt: &Attempt,
+    config: SimConfig,
+    (path, spi_trace): (Option<Files>, Option<Output>),
+) -> ExitCode {
     let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
     let ended = match asked_to_end() {
         Ok(ended) => ended,
         Err(error) => return failed(error),
     };
+    let mut record = None;
     let tried = || {
         let clock = clock::clock();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
@@ -268,6 +275,14 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
         let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
         attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
+        if let Some(trace) = spi_trace {
+            probe.record_spi(trace.make()?);
+        }
+        if let Some(files) = path {
+            let path = PathRecord::new(files, probe.clone());
+            one.watch(path.reader());
+            record = Some(path);
+        }
         let time = Time::One(Box::new(one));
         let done = match &attempt.print {
             Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
@@ -283,8 +298,11 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
         }
     };
     match tried() {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
+        Ok(true) => record.map_or(ExitCode::SUCCESS, PathRecord::end),
+        Ok(false) => {
+            record.map(PathRecord::end);
+            ExitCode::FAILURE
+        }
         Err(_) if ended.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Err(trouble) => failed(trouble),
     }
