@@ -143,6 +143,8 @@ impl Host {
         let mut command = rights::confined();
         let turns = match &mut time {
             Time::Real(..) => None,
+            // The library is for 64 bits.
+            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
             Time::One(clock) => {
                 let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
                 // What follows env, and nothing before it, has the library.
