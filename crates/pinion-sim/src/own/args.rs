@@ -113,6 +113,11 @@ impl OwnArgs {
         named().or_else(pinion::cli::klipper_here)
     }
 
+    /// Whether the command line names the checkout.
+    pub(super) fn names_klipper(&self) -> bool {
+        self.klipper.is_some()
+    }
+
     pub(super) fn python(&self) -> Option<&Path> {
         self.python.as_deref()
     }

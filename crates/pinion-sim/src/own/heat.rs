@@ -14,6 +14,8 @@ const RESERVE: f64 = 1.3;
 /// The highest temperatures that full power reaches without [`RESERVE`], of a bed and of others. A `max_temp` above any
 /// real one only switches klippy's check off.
 const REAL_MAX_CELSIUS: [f64; 2] = [150.0, 500.0];
+/// No heater of a printer is as hot as this.
+const UNREAL_CELSIUS: f64 = 1000.0;
 /// Heat that a heater's mass stores. Only its ratio to the power counts.
 const J_PER_K: f64 = 15.0;
 /// klippy's PID parameters are for a power of 0 to this.
@@ -64,6 +66,13 @@ impl Translator<'_> {
         let pin = self.take(section, "heater_pin")?.or(nothing);
         let min = section.number("min_temp", Limit::Any)?.unwrap_or(0.0);
         let max = section.number("max_temp", Limit::Any)?.unwrap_or(100.0);
+        if max > UNREAL_CELSIUS {
+            self.note(
+                section,
+                &format!("has max_temp {max}, with which klippy checks nothing"),
+                "write the highest safe one",
+            );
+        }
         let start = AMBIENT_CELSIUS.clamp(min.min(max), max.max(min));
         let mut entry = Entry::default().set("name", name.as_str()).set("min_celsius", min).set("max_celsius", max);
         if start != AMBIENT_CELSIUS {

@@ -51,11 +51,19 @@ pub(super) struct Klippy {
 }
 
 impl Klippy {
-    /// The klippy that the user has named, or that this computer has.
+    /// The klippy that the user has named, or that this computer has. `None` for root.
     pub(super) fn of(args: &OwnArgs) -> Option<Klippy> {
         let folder = args.klipper().filter(|folder| folder.join("klippy/klippy.py").is_file())?;
         let python = attempt::python(args.python(), &folder);
-        Some(Klippy { folder, python })
+        let klippy = Klippy { folder, python };
+        // Files that root can read are not for the user as whom klippy could run.
+        if geteuid().is_root() {
+            if args.names_klipper() {
+                klippy.unasked("it never runs as root: call this as an ordinary user");
+            }
+            return None;
+        }
+        Some(klippy)
     }
 
     /// Asks it about a configuration. Returns whether it has judged.
@@ -64,11 +72,6 @@ impl Klippy {
     ///
     /// klippy refuses the configuration: its words, with the line.
     pub(super) fn judge(&self, own: &Own) -> Result<bool, Trouble> {
-        // Files that root can read are not for the user as whom klippy could run.
-        if geteuid().is_root() {
-            self.unasked("it never runs as root: call this as an ordinary user");
-            return Ok(false);
-        }
         match self.output(own) {
             Ok(output) => match refusal(&output) {
                 // A module may ask for pins that no option names, and the simulated MCUs have none of these.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use pinion_linux::foreign;
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
-use super::known::{is_numbered, lacks_module, motor_of};
+use super::known::{is_numbered, lacks_module, motor_of, near};
 use super::sensors::is_known;
 
 /// The probes of plugins.
@@ -55,7 +55,8 @@ impl LeftOut {
     ///
     /// The offsets of a plugin's probe are no numbers.
     pub(super) fn of(config: &Config, klipper: Option<&Path>) -> Result<LeftOut, Trouble> {
-        let is_plugins = |section: &Section| lacks_module(section.kind(), klipper);
+        // A misspelled section is no plugin's: klippy refuses it.
+        let is_plugins = |section: &Section| lacks_module(section.kind(), klipper) && near(section.kind()).is_none();
         let all = config.sections();
         let is_without_pin = |section: &Section| section.text("pin").is_none() && section.name == "probe";
         let has_own_probe = all.iter().any(|section| OWN_PROBES.contains(&section.kind()) && !is_without_pin(section));
@@ -168,6 +169,11 @@ mod tests {
             "temperature_sensor a",
         ];
         assert_eq!(left_out(text, None).0, expected);
+    }
+
+    #[test]
+    fn a_misspelled_section_stays() {
+        assert_eq!(left_out("[heater_fann hotend]\npin: PA1\n[shaketune]\n", None).0, ["shaketune"]);
     }
 
     #[test]

@@ -118,6 +118,9 @@ fn a_max_temp_that_is_no_limit_insulates_nothing() {
         let bed = named(&description, "heater", "name", "heater_bed");
         bed["loss_w_per_k"].as_float().unwrap() / bed["heater_watts"].as_float().unwrap()
     };
+    let text = PRINTER.replace("max_temp: 250", "max_temp: 2600");
+    let notes = translated(&text).unwrap().notes;
+    assert!(notes.len() == 1 && notes[0].to_string().contains("[extruder] has max_temp 2600"), "{notes:?}");
     assert!(loss("9999") > loss("110") / 2.0, "{} {}", loss("9999"), loss("110"));
 }
 
