@@ -61,10 +61,10 @@ pub(crate) enum Stop {
 impl Display for Stop {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Stop::Ended => f.write_str("klippy ended"),
+            Stop::Ended => f.write_str("it has ended"),
             Stop::Computes => {
                 let seconds = COMPUTE.as_secs();
-                write!(f, "klippy has computed for {seconds} s and waits for nothing: look for an endless loop")
+                write!(f, "it has computed for {seconds} s and waits for nothing: look for an endless loop")
             }
             Stop::Asked => f.write_str("the trial was ended"),
         }
