@@ -28,7 +28,7 @@ use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
 use crate::attempt::time::Time;
-use crate::attempt::{self, Attempt};
+use crate::attempt::{self, Attempt, Form};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
 use crate::clock::{self, OneClock};
@@ -124,6 +124,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Some(file) => match leave_root(args, file).and_then(|()| own::run::read(file, &args.own)) {
             Ok(own) => Some(own),
             Err(mistake) if args.own.attempt => return attempt::refused(file, mistake, args.own.form()),
+            Err(mistake) if args.own.form() == Form::Json => return attempt::print::refused(file, &mistake),
             Err(mistake) => return failed(mistake),
         },
         None if args.own.is_used() => {
