@@ -129,7 +129,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         },
         None if args.own.is_used() => {
             return failed(
-                "--try, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
+                "--try, --print, --speed, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
             );
         }
         None => None,
