@@ -43,10 +43,7 @@ impl Emulator {
     /// wake at the moment when the guest becomes idle. Instructions that are not yet accounted for would then be added
     /// to the passed time: up to several microseconds. Two runs would then not be the same.
     fn settle_order(&self) {
-        let mut chrt = Command::new("chrt");
-        // Only for this thread: -R excludes the threads that it starts.
-        chrt.args(["-R", "-f", "-p", "1", &self.qemu.id().to_string()]);
-        if let Err(cause) = process::run(&mut chrt) {
+        if let Err(cause) = process::put_main_thread_first(&self.qemu) {
             eprintln!("figures may differ from one run to the next in the fourth digit: {cause}");
         }
     }

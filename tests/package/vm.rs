@@ -200,6 +200,8 @@ fn start(
         .args(["-device", "virtserialport,chardev=agent,name=agent"])
         .args(["-serial", &format!("file:{}", file("console"))]);
     let (child, input, output) = process::start_emulator(&mut qemu, folder)?;
+    // Late, it would add the time that it waited for a processor to the guest's.
+    process::put_main_thread_first(&child)?;
     let (heard, lines) = channel();
     thread::spawn(move || {
         for line in BufReader::new(output).lines().map_while(Result::ok) {

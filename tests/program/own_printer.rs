@@ -139,6 +139,14 @@ fn a_print_says_what_it_needs() {
         assert!(log.contains(words), "{arguments:?}: {log}");
     }
     assert!(fs::read_to_string(cfg).unwrap().contains("[printer]"), "the plot has replaced it");
+    let (_home, wrong) = folder_with("printer.cfg", &PRINTER.replace("[printer]", "[printer]\n[include no.cfg]"));
+    let (code, out, log) = output(&["sim", wrong.to_str().unwrap(), "--print", gcode, "--klipper", "/", "--json"]);
+    let report: serde_json::Value = serde_json::from_str(&out).expect(&log);
+    assert_eq!(
+        (code, &report["passed"], &report["stopped"]["line"]),
+        (Some(1), &false.into(), &serde_json::Value::Null)
+    );
+    assert!(report["stopped"]["why"].as_str().unwrap().contains("no.cfg"), "{report}");
 }
 
 /// A step that is misspelled would try nothing, and pass.

@@ -28,7 +28,7 @@ use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
 use crate::attempt::time::Time;
-use crate::attempt::{self, Attempt};
+use crate::attempt::{self, Attempt, Form};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
 use crate::clock::{self, OneClock};
@@ -124,11 +124,12 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Some(file) => match leave_root(args, file).and_then(|()| own::run::read(file, &args.own)) {
             Ok(own) => Some(own),
             Err(mistake) if args.own.attempt => return attempt::refused(file, mistake, args.own.form()),
+            Err(mistake) if args.own.form() == Form::Json => return attempt::print::refused(file, &mistake),
             Err(mistake) => return failed(mistake),
         },
         None if args.own.is_used() => {
             return failed(
-                "--try, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
+                "--try, --print, --speed, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
             );
         }
         None => None,
@@ -159,7 +160,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
     if let Some((owner, attempt)) = owner.as_ref().and_then(|owner| Some((owner, owner.attempt.as_ref()?)))
         && !attempt.real_time
     {
-        return run_in_one_clock(args, owner, attempt, config);
+        return run_in_one_clock(args, owner, attempt, config, (path, spi_trace));
     }
     let links = match &owner {
         Some(owner) => owner.place.links().to_vec(),
@@ -251,12 +252,19 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
 }
 
 /// Tries a printer whose klippy has the printer's clock, or prints on it, or serves it.
-fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: SimConfig) -> ExitCode {
+fn run_in_one_clock(
+    args: &SimArgs,
+    owner: &Owner,
+    attempt: &Attempt,
+    config: SimConfig,
+    (path, spi_trace): (Option<Files>, Option<Output>),
+) -> ExitCode {
     let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
     let ended = match asked_to_end() {
         Ok(ended) => ended,
         Err(error) => return failed(error),
     };
+    let mut record = None;
     let tried = || {
         let clock = clock::clock();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
@@ -268,6 +276,14 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
         let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
         attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
+        if let Some(trace) = spi_trace {
+            probe.record_spi(trace.make()?);
+        }
+        if let Some(files) = path {
+            let path = PathRecord::new(files, probe.clone());
+            one.watch(path.reader());
+            record = Some(path);
+        }
         let time = Time::One(Box::new(one));
         let done = match &attempt.print {
             Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
@@ -283,8 +299,11 @@ fn run_in_one_clock(args: &SimArgs, owner: &Owner, attempt: &Attempt, config: Si
         }
     };
     match tried() {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
+        Ok(true) => record.map_or(ExitCode::SUCCESS, PathRecord::end),
+        Ok(false) => {
+            record.map(PathRecord::end);
+            ExitCode::FAILURE
+        }
         Err(_) if ended.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Err(trouble) => failed(trouble),
     }

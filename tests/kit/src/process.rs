@@ -53,6 +53,12 @@ pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, Ch
     Ok((emulator, input, output))
 }
 
+/// Has the emulator's main thread run at once, whenever it has work. It advances the time while the guest is idle.
+pub fn put_main_thread_first(emulator: &Child) -> Result<(), String> {
+    // Only for this thread: -R excludes the threads that it starts.
+    run(Command::new("chrt").args(["-R", "-f", "-p", "1", &emulator.id().to_string()]))
+}
+
 /// The processor time of a running child so far. An emulator that a busy computer stops uses none.
 pub fn processor_time(child: &Child) -> Result<Duration, String> {
     let time = ClockId::pid_cpu_clock_id(Pid::from_raw(child.id().cast_signed())).and_then(ClockId::now);

@@ -143,6 +143,8 @@ impl Host {
         let mut command = rights::confined();
         let turns = match &mut time {
             Time::Real(..) => None,
+            // The library is for 64 bits.
+            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
             Time::One(clock) => {
                 let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
                 // What follows env, and nothing before it, has the library.
@@ -282,7 +284,7 @@ impl Host {
         self.next_id += 1;
         let mut request = json!({ "id": self.next_id, "method": method, "params": params }).to_string().into_bytes();
         request.push(END);
-        self.api.write_all(&request).map_err(|error| Refused::Gone(error.to_string()))?;
+        self.api.write_all(&request).map_err(|_| Refused::Gone(Stop::Ended.to_string()))?;
         self.time.poke();
         Ok(self.next_id)
     }
@@ -332,7 +334,7 @@ impl Host {
             }
             let gone = |cause: &str| Refused::Gone(cause.to_owned());
             match self.api.read(&mut piece) {
-                Ok(0) => return Err(gone("klippy ended")),
+                Ok(0) => return Err(Stop::Ended.into()),
                 Ok(read) => self.buffer.extend_from_slice(&piece[..read]),
                 Err(error) => return Err(gone(&error.to_string())),
             }

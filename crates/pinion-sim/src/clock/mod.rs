@@ -42,6 +42,8 @@ const LOAD: Duration = Duration::from_secs(20);
 const COMPUTE: Duration = Duration::from_secs(120);
 /// How far klippy's readings of the clock may move it in a turn.
 const READINGS_NS_MAX: u64 = 10_000_000_000;
+/// Time between two calls of a watch: a track of a motor holds half a second of 32,000 steps a second.
+const WATCH: Duration = Duration::from_millis(50);
 /// Real time between two looks whether the program shall end.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -59,10 +61,10 @@ pub(crate) enum Stop {
 impl Display for Stop {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Stop::Ended => f.write_str("klippy ended"),
+            Stop::Ended => f.write_str("it has ended"),
             Stop::Computes => {
                 let seconds = COMPUTE.as_secs();
-                write!(f, "klippy has computed for {seconds} s and waits for nothing: look for an endless loop")
+                write!(f, "it has computed for {seconds} s and waits for nothing: look for an endless loop")
             }
             Stop::Asked => f.write_str("the trial was ended"),
         }
@@ -87,6 +89,8 @@ pub(crate) struct OneClock {
     /// klippy takes no more turns.
     has_stopped: bool,
     pace: Option<Pace>,
+    /// Is called now and then while time passes, and when next.
+    watch: Option<(Box<dyn FnMut()>, u64)>,
     /// Set when the program is asked to end.
     ended: Arc<AtomicBool>,
 }
@@ -151,6 +155,7 @@ impl OneClock {
             has_news: true,
             has_stopped: false,
             pace: None,
+            watch: None,
             ended,
         })
     }
@@ -158,6 +163,11 @@ impl OneClock {
     /// Keeps the printer's time to this many seconds in a second, if the computer is fast enough.
     pub(crate) fn keep_pace(&mut self, speed: f64) {
         self.pace = Some(Pace { speed, from: (Instant::now(), self.now_ns) });
+    }
+
+    /// Has `watch` called each [`WATCH`] of the printer's time.
+    pub(crate) fn watch(&mut self, watch: impl FnMut() + 'static) {
+        self.watch = Some((Box::new(watch), self.now_ns));
     }
 
     pub(crate) fn now(&self) -> Duration {
@@ -229,6 +239,13 @@ impl OneClock {
                 return Ok(false);
             }
             let mut limit_ns = until_ns.min(player_ns);
+            if let Some((watch, due_ns)) = &mut self.watch {
+                if self.now_ns >= *due_ns {
+                    watch();
+                    *due_ns = self.now_ns + WATCH.as_nanos() as u64;
+                }
+                limit_ns = limit_ns.min(*due_ns);
+            }
             if let Some(pace) = &mut self.pace {
                 let paced_ns = pace.until_ns(self.now_ns);
                 if paced_ns <= self.now_ns {

@@ -12,7 +12,7 @@ started=$(($(seconds) - $(up)))
 for hours in 5 -11 6; do
     jump $hours
     # Longer than the heater stays on without a refresh.
-    sleep 4
+    sleep 3.5
     is_high 3
     near $(($(seconds) - $(up))) "$started" 3 "when it started, by its status"
 done

@@ -9,6 +9,7 @@ mod report;
 use std::fs;
 use std::io::{BufReader, Write as _};
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -17,7 +18,7 @@ use pinion::cli::page::{Page, print};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks};
 use pinion_printer_config::Trouble;
 use pinion_sim::{AskedPath, PathPoint, SimProbe, compare};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::host::{Host, NoStart};
 use super::time::Time;
@@ -120,6 +121,16 @@ pub(crate) fn run(
         log::warn!("{error}");
     }
     Ok(Some(printed.passed()))
+}
+
+/// Reports a mistake in printer.cfg, for programs.
+pub(crate) fn refused(printer: &Path, mistake: &Trouble) -> ExitCode {
+    let stopped = json!({ "line": null, "text": null, "why": mistake.to_string() });
+    let report = json!({ "printer": printer.display().to_string(), "passed": false, "stopped": stopped });
+    if let Err(error) = print(&Page::json(&format!("{report}\n"))) {
+        log::warn!("{error}");
+    }
+    ExitCode::FAILURE
 }
 
 /// Puts the file where klippy looks for files to print.
