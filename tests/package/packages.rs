@@ -12,9 +12,8 @@ use pinion_testkit::{process, simulator};
 pub fn share(folder: &Path) -> Result<(), String> {
     fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let tree = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let strip = |program: &Path, name: &str| {
-        process::run(Command::new("strip").arg("-o").arg(folder.join(name)).arg(program))
-    };
+    let strip =
+        |program: &Path, name: &str| process::run(Command::new("strip").arg("-o").arg(folder.join(name)).arg(program));
     // The program that cargo has built for all tests.
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
     strip(pinion, "pinion")?;
