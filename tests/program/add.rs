@@ -6,10 +6,10 @@ use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown, symlink};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::thread;
-use std::time::Duration;
 
+use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
 use pinion_testkit::here;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -616,32 +616,65 @@ fn a_full_disk_leaves_the_old_files() {
     assert_eq!(card.snapshot(), before);
 }
 
-/// Kills the program at many moments. Each file is the old or the new one, and a later call finishes.
+/// The changes in the folders of a card.
+struct Changes(Inotify);
+
+impl Changes {
+    fn of(card: &Card) -> Changes {
+        let watch = Inotify::init(InitFlags::IN_NONBLOCK).unwrap();
+        let kinds = AddWatchFlags::IN_CREATE | AddWatchFlags::IN_MOVED_TO | AddWatchFlags::IN_DELETE;
+        for folder in ["boot/firmware", Path::new(PRINTER).parent().unwrap().to_str().unwrap()] {
+            watch.add_watch(&card.path(folder), kinds).unwrap();
+        }
+        Changes(watch)
+    }
+
+    /// Waits until the program has made this many. False if it ends before.
+    fn reach(&self, count: usize, program: &mut Child) -> bool {
+        let mut seen = 0;
+        loop {
+            let has_ended = program.try_wait().unwrap().is_some();
+            seen += self.0.read_events().map_or(0, |events| events.len());
+            if seen >= count || has_ended {
+                return !has_ended;
+            }
+            thread::yield_now();
+        }
+    }
+}
+
+/// Kills the program after each of its changes. Each file is the old or the new one, and a later call finishes.
 #[test]
 fn a_kill_leaves_each_file_old_or_new() {
     let whole = Card::pi();
     whole.added(&["adxl345", "--yes"]);
-    for round in 0..24u64 {
-        let card = Card::pi();
-        let before = card.snapshot();
-        let undoes = round % 2 == 1;
-        if undoes {
+    for undoes in [false, true] {
+        let mut killed = 0;
+        for count in 1.. {
+            let card = Card::pi();
+            let before = card.snapshot();
+            if undoes {
+                card.added(&["adxl345", "--yes"]);
+            }
+            let arguments =
+                card.arguments(if undoes { &["adxl345", "--yes", "--undo"] } else { &["adxl345", "--yes"] });
+            let changes = Changes::of(&card);
+            let mut child = program().args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+            if !changes.reach(count, &mut child) {
+                break;
+            }
+            child.kill().unwrap();
+            killed += usize::from(!child.wait().unwrap().success());
+            for path in [PRINTER, "boot/firmware/config.txt"] {
+                let old = if path == PRINTER { PRINTER_CFG } else { CONFIG_TXT };
+                let now = card.read(path);
+                assert!(now == old || now == whole.read(path), "after {count} changes: {path}: {now}");
+            }
             card.added(&["adxl345", "--yes"]);
+            card.added(&["adxl345", "--undo", "--yes"]);
+            assert_eq!(card.snapshot(), before, "after {count} changes");
         }
-        let arguments = card.arguments(if undoes { &["adxl345", "--yes", "--undo"] } else { &["adxl345", "--yes"] });
-        let mut child = program().args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        thread::sleep(Duration::from_micros(700 * round));
-        // It may have ended already, or not have begun.
-        let _ = child.kill();
-        child.wait().unwrap();
-        for path in [PRINTER, "boot/firmware/config.txt"] {
-            let old = if path == PRINTER { PRINTER_CFG } else { CONFIG_TXT };
-            let now = card.read(path);
-            assert!(now == old || now == whole.read(path), "round {round}: {path}: {now}");
-        }
-        card.added(&["adxl345", "--yes"]);
-        card.added(&["adxl345", "--undo", "--yes"]);
-        assert_eq!(card.snapshot(), before, "round {round}");
+        assert!(killed > 3, "killed {killed} times");
     }
 }
 
