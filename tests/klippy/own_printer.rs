@@ -203,7 +203,7 @@ fn as_a_user() -> Command {
 }
 
 /// Changes that klippy takes and that do not fit the printer: the step that fails, and a part of its text.
-const MISFITS: [(&str, &str, &str, &str); 8] = [
+const MISFITS: [(&str, &str, &str, &str); 9] = [
     ("dir_pin: PB9", "dir_pin: !PB9", "homed", "No trigger on stepper_x after full movement"),
     ("dir_pin: !PB5", "dir_pin: PB5", "homed", "No trigger on stepper_z after full movement"),
     ("endstop_pin: ^PA5", "endstop_pin: ^!PA5", "homed", "Endstop stepper_x still triggered after retract"),
@@ -214,6 +214,7 @@ const MISFITS: [(&str, &str, &str, &str); 8] = [
     ("sensor_pin: PC5", "sensor_pin: PC6", "heated", ""),
     // The motor goes twice as far, and to the end of its travel.
     ("rotation_distance: 40", "rotation_distance: 20", "printed", ""),
+    ("rotation_distance: 8\n", "rotation_distance: 80\n", "printed", "mm apart, not 0.200 mm"),
 ];
 
 #[test]

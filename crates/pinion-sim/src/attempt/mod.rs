@@ -3,7 +3,7 @@
 
 mod host;
 pub(crate) mod paced;
-mod place;
+pub(crate) mod place;
 pub(crate) mod print;
 mod report;
 pub(crate) mod rights;

@@ -24,10 +24,9 @@ use pinion_sim::{SimConfig, SimWorld};
 
 use super::args::OwnArgs;
 use super::known::near;
-use super::place::place_of;
-use super::rights;
 use super::serve::{Folder, Own};
-use crate::attempt;
+use crate::attempt::place::place_of;
+use crate::attempt::{self, rights};
 
 /// How long klippy may take. It ends after some two seconds on a Raspberry Pi 3.
 const TIMEOUT: Duration = Duration::from_secs(60);

@@ -29,13 +29,5 @@ pub(crate) use translate::Pace;
 #[cfg(test)]
 use translate::{Translated, translate};
 
-// The trial's room shows these to itself only.
-#[allow(dead_code, clippy::duplicate_mod)]
-#[path = "../attempt/place.rs"]
-mod place;
-#[allow(dead_code, clippy::duplicate_mod)]
-#[path = "../attempt/rights.rs"]
-mod rights;
-
 #[cfg(test)]
 mod tests;

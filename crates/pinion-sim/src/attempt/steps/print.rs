@@ -10,7 +10,7 @@ use pinion_sim::{AskedPath, PathPoint, Recorder, compare};
 
 use super::heaters::heat_extruder;
 use super::homing::said_mm;
-use super::square::square;
+use super::square::{LAYER_MM, square};
 use super::{Seen, skipped};
 use crate::attempt::host::Refused;
 use crate::attempt::report::Outcome;
@@ -20,6 +20,8 @@ use crate::attempt::trial::{LONG, Trial, travel};
 const PRINT: Duration = Duration::from_secs(4 * 3600);
 /// Longest G-code file.
 const GCODE_MIB: u64 = 256;
+/// How far apart two layers may be beside what the square asks for.
+const LAYER_OFF_MM: f64 = 0.05;
 /// Distance above which a print is wrong.
 const WITHIN_MM: f64 = 0.1;
 
@@ -64,7 +66,33 @@ pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
     if let Some(line) = found.ends_at_line {
         return Err(trial.failed(format!("{name}: the path ends at line {line}"), None));
     }
+    if trial.attempt.gcode.is_none() {
+        layers_are_apart(trial, &points)?;
+    }
     Ok(format!("{name}: {:.0} mm, at most {mm:.3} mm off", found.all.length_mm))
+}
+
+/// Fails if the two layers of the small square are not as far apart as it asks for. A mesh moves both alike.
+fn layers_are_apart(trial: &Trial<'_>, points: &[PathPoint]) -> Result<(), Outcome> {
+    let laid: f64 = points.iter().map(|point| f64::from(point.laid_mm)).sum();
+    // Of both layers: the sum of the heights by the filament that was laid there, and that filament.
+    let mut layers = [(0.0, 0.0); 2];
+    let mut so_far = 0.0;
+    for point in points {
+        let here = f64::from(point.laid_mm);
+        let (sum, filament) = &mut layers[usize::from(so_far + here / 2.0 > laid / 2.0)];
+        *sum += point.nozzle_mm[2] * here;
+        *filament += here;
+        so_far += here;
+    }
+    let [low, high] = layers.map(|(sum, filament)| sum / filament);
+    let apart = high - low;
+    if (apart - LAYER_MM).abs() > LAYER_OFF_MM {
+        let cause = format!("the layers of the square are {apart:.3} mm apart, not {LAYER_MM:.3} mm");
+        let section = trial.config().section("stepper_z");
+        return Err(trial.failed(cause, section.map(|section| section.place_of("rotation_distance").clone())));
+    }
+    Ok(())
 }
 
 /// Homes and heats for the small square. A file of the user does that itself.
