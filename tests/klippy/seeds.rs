@@ -10,7 +10,7 @@ use super::sections::pinion;
 
 /// Longest seed of raw bytes: the configuration and some moves.
 const BYTES_MAX: usize = 6000;
-/// The steps of the target `link` (crates/runtime/src/link/fuzz.rs): 31 raw bytes, the host reads, the core begins a block,
+/// The steps of the target `link` (crates/runtime/tests/support/link_fuzz.rs): 31 raw bytes, the host reads, the core begins a block,
 /// responds, and finishes.
 const STEPS: [u8; 5] = [31 << 3, 3, 4, 5 | 5 << 3, 6];
 

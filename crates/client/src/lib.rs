@@ -19,6 +19,7 @@ pub mod client;
 pub mod config;
 pub mod console;
 #[cfg(test)]
+#[path = "../tests/support/fake.rs"]
 mod fake;
 pub mod messages;
 pub mod motion;

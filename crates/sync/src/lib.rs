@@ -30,4 +30,5 @@ mod atomic {
 }
 
 #[cfg(all(loom, test))]
+#[path = "../tests/support/model.rs"]
 mod model;

@@ -29,6 +29,7 @@ use pinion_trace::file::End;
 
 #[cfg(fuzzing)]
 #[allow(clippy::expect_used)]
+#[path = "../../tests/support/guardian_fuzz.rs"]
 pub(crate) mod fuzz;
 
 /// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.

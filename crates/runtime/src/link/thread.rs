@@ -33,6 +33,7 @@ use pinion_trace::ring;
 
 #[cfg(fuzzing)]
 #[allow(clippy::expect_used)]
+#[path = "../../tests/support/link_fuzz.rs"]
 pub(crate) mod fuzz;
 
 /// The messages that the link answers itself.
