@@ -16,7 +16,7 @@ pub(crate) const LOOK_MS: i32 = 5;
 /// A child that is still there after this real time holds the clock no longer. A plugin's child may run for ever.
 const HOLD: Duration = Duration::from_secs(60);
 
-/// Words that klippy shares with its forks. At most so many of them are known at a time.
+/// Highest number of children that are known at a time. Each has a word that klippy shares with it.
 const WORDS: usize = 256;
 /// No word of one's own.
 const NONE: u32 = u32::MAX;
@@ -80,15 +80,18 @@ fn free_word() -> usize {
     word
 }
 
-fn forked(pid: libc::pid_t, word: usize) {
+fn forked(pid: libc::pid_t, word: usize, is_main: bool) {
     match pid {
         0 => {
             turns::leave();
             // SAFETY: a fork has one thread. What it starts is no participant either.
             unsafe { libc::unsetenv(c"LD_PRELOAD".as_ptr()) };
             MINE.store(word as u32, Ordering::Relaxed);
-            // SAFETY: it has the arguments that prctl(2) names. The child ends with klippy.
-            unsafe { libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL) };
+            if is_main {
+                // SAFETY: it has the arguments that prctl(2) names. The child ends with the thread that starts it, which
+                // is klippy's end for this one only.
+                unsafe { libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL) };
+            }
         }
         pid if pid > 0 => {
             CHILDREN.lock().unwrap_or_else(PoisonError::into_inner).push(Child { pid, looks: 0, word });
@@ -128,9 +131,11 @@ pub unsafe extern "C" fn write(fd: libc::c_int, bytes: *const c_void, count: usi
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn fork() -> libc::pid_t {
     let word = crate::threads::is_one().then(free_word);
+    // SAFETY: they have no arguments.
+    let is_main = unsafe { libc::gettid() == libc::getpid() };
     let pid = real!(fn fork() -> libc::pid_t);
     if let Some(word) = word {
-        forked(pid, word);
+        forked(pid, word, is_main);
     }
     pid
 }
@@ -174,7 +179,7 @@ macro_rules! spawn {
             ) -> libc::c_int);
             if status == 0 && crate::threads::is_one() {
                 // SAFETY: it is the caller's, or ours.
-                forked(unsafe { *pid }, free_word());
+                forked(unsafe { *pid }, free_word(), false);
             }
             status
         }

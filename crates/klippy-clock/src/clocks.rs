@@ -10,7 +10,9 @@ use crate::threads::{Wait, has_read, is_one, wait, yield_token};
 use crate::turns::{NEVER, is_on, now_ns, read_ns, wall_ns};
 
 const SECOND_NS: u64 = 1_000_000_000;
-/// What a yield takes, so that a loop of yields until a time ends.
+/// The shortest sleep, as long as the kernel's usual timer slack.
+const SLACK_NS: u64 = 50_000;
+/// Readings that a yield counts as, so that a loop of yields reaches its end.
 const YIELDS: u32 = 50;
 
 fn is_wall(clock: clockid_t) -> bool {
@@ -26,7 +28,7 @@ fn timespec_of(ns: u64) -> timespec {
     timespec { tv_sec: (ns / SECOND_NS) as libc::time_t, tv_nsec: (ns % SECOND_NS) as libc::c_long }
 }
 
-fn ns_of(time: &timespec) -> u64 {
+pub(crate) fn ns_of(time: &timespec) -> u64 {
     (time.tv_sec.max(0) as u64).saturating_mul(SECOND_NS).saturating_add(time.tv_nsec.max(0) as u64)
 }
 
@@ -113,7 +115,8 @@ pub unsafe extern "C" fn clock_nanosleep(
             -> c_int);
     }
     // SAFETY: invariant 1.
-    let end = unsafe { if flags & libc::TIMER_ABSTIME != 0 { deadline(time) } else { after(ns_of(&*time)) } };
+    let end =
+        unsafe { if flags & libc::TIMER_ABSTIME != 0 { deadline(time) } else { after(ns_of(&*time).max(SLACK_NS)) } };
     while now_ns() < end {
         wait(Wait::Time, end);
     }

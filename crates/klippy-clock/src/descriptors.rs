@@ -13,7 +13,7 @@ use std::sync::OnceLock;
 
 use libc::{c_char, c_int, epoll_event, fd_set, nfds_t, pollfd, timespec, timeval};
 
-use crate::clocks::after;
+use crate::clocks::{after, ns_of};
 use crate::real::real;
 use crate::threads::{Wait, Woken, is_one, wait, yield_token};
 use crate::turns::NEVER;
@@ -81,7 +81,7 @@ pub unsafe extern "C" fn ppoll(
     }
     // SAFETY: invariant 1.
     unsafe {
-        let end = time.as_ref().map_or(NEVER, |time| after(time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64));
+        let end = time.as_ref().map_or(NEVER, |time| after(ns_of(time)));
         await_any(fds, count, end)
     }
 }
@@ -132,7 +132,8 @@ pub unsafe extern "C" fn select(
     }
     // SAFETY: invariant 1; the array is ours.
     unsafe {
-        let span = time.as_ref().map(|time| time.tv_sec as u64 * 1_000_000_000 + time.tv_usec as u64 * 1000);
+        let of = |time: &timeval| timespec { tv_sec: time.tv_sec, tv_nsec: time.tv_usec * 1000 };
+        let span = time.as_ref().map(|time| ns_of(&of(time)));
         await_any(fds.as_mut_ptr(), fds.len() as nfds_t, span.map_or(NEVER, after));
     }
     real(&mut timeval { tv_sec: 0, tv_usec: 0 })

@@ -67,7 +67,7 @@ static END: AtomicU32 = AtomicU32::new(0);
 
 /// No thread of ours.
 const NONE: usize = usize::MAX;
-/// After so many readings of the clock in a row, others get a turn: somebody may wait for them in a loop.
+/// A thread yields after this many readings of the clock in a row: another may need the token.
 const READINGS_MAX: u32 = 256;
 
 thread_local! {

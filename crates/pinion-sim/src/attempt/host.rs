@@ -28,6 +28,8 @@ use pinion_sim::{PaceWatch, Recorder, SimProbe};
 
 /// The end of a message.
 const END: u8 = 3;
+/// Highest number of lines of klippy's output that are kept.
+const SAID_MAX: usize = 10_000;
 /// Longest message.
 const MESSAGE_MAX: usize = 64 << 20;
 /// How long klippy has to open its API.
@@ -248,16 +250,18 @@ impl Host {
     }
 
     /// Lets time pass.
-    pub(super) fn sleep(&mut self, span: Duration) {
+    ///
+    /// # Errors
+    ///
+    /// klippy takes no more turns.
+    pub(super) fn sleep(&mut self, span: Duration) -> Result<(), Stop> {
         let until = self.now() + span;
         while self.now() < until {
             let next = until.min(self.now() + READ_PATH);
-            // A klippy that is gone does not answer the next question.
-            if self.time.sleep(next.saturating_sub(self.now())).is_err() {
-                return;
-            }
+            self.time.sleep(next.saturating_sub(self.now()))?;
             self.look();
         }
+        Ok(())
     }
 
     /// Does what has to be done now and then.
@@ -296,7 +300,9 @@ impl Host {
                 Some(message) => message,
                 None => self.message(until)?,
             };
-            if let Some(line) = message["params"]["response"].as_str() {
+            if let Some(line) = message["params"]["response"].as_str()
+                && self.said.len() < SAID_MAX
+            {
                 self.said.push(line.to_owned());
             }
             match message["id"].as_u64() {
@@ -309,8 +315,8 @@ impl Host {
                         }
                     };
                 }
-                Some(other) => _ = self.answers.insert(other, message),
-                None => {}
+                Some(other) if other < id => _ = self.answers.insert(other, message),
+                _ => {}
             }
         }
     }
@@ -368,12 +374,11 @@ impl Host {
         loop {
             match self.state() {
                 Ok((state, _)) if state == "ready" => {
-                    self.sleep(FIRST_MOMENTS);
-                    return Ok(());
+                    return self.sleep(FIRST_MOMENTS).map_err(|stop| stop.to_string());
                 }
                 Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
                 Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
-                Ok(_) => self.sleep(Duration::from_millis(100)),
+                Ok(_) => self.sleep(LOOK_FOR_API).map_err(|stop| stop.to_string())?,
                 // A klippy that finds its MCU shut down restarts both.
                 Err(Refused::Gone(_)) if self.now() < until && self.reconnect() => {}
                 Err(refused) => return Err(format!("klippy does not answer: {refused}")),
@@ -419,7 +424,9 @@ impl Host {
         // The answer may come before the restart, or never.
         let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
         while self.state().is_ok() && self.now() < until {
-            self.sleep(LOOK_FOR_API);
+            if self.sleep(LOOK_FOR_API).is_err() {
+                break;
+            }
         }
         self.reconnect();
     }
@@ -428,6 +435,10 @@ impl Host {
     pub(super) fn reconnect(&mut self) -> bool {
         let until = self.now() + START;
         while matches!(self.child.try_wait(), Ok(None)) && self.now() < until {
+            // klippy that takes no more turns answers no more.
+            if self.sleep(LOOK_FOR_API).is_err() {
+                return false;
+            }
             if let Ok(api) = UnixStream::connect(&self.socket) {
                 self.api = api;
                 self.buffer.clear();
@@ -436,7 +447,6 @@ impl Host {
                     return true;
                 }
             }
-            self.sleep(LOOK_FOR_API);
         }
         false
     }
@@ -446,18 +456,21 @@ impl Host {
         let pid = self.child.id().cast_signed();
         // Another klippy may run already.
         let _ = self.running.0.compare_exchange(pid, 0, Ordering::SeqCst, Ordering::SeqCst);
+        // It leads a group of its own, so what it has started ends, too.
+        let group = || signal::killpg(Pid::from_raw(pid), Signal::SIGKILL);
         if matches!(self.child.try_wait(), Ok(Some(_))) {
+            let _ = group();
             return;
         }
         let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
         let until = Instant::now() + END_TIME;
         while Instant::now() < until {
             if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
-                return;
+                break;
             }
             thread::sleep(Duration::from_millis(20));
         }
-        let _ = self.child.kill();
+        let _ = group();
         let _ = self.child.wait();
     }
 }

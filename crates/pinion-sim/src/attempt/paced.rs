@@ -13,6 +13,7 @@ use pinion_sim::SimProbe;
 use super::Attempt;
 use super::host::{Host, NoStart};
 use super::time::Time;
+use crate::clock::Stop;
 use crate::own::serve::Folder;
 use crate::own_status::OwnStatus;
 
@@ -47,9 +48,13 @@ pub(crate) fn run(
         log::warn!("{error}");
     }
     while !ended.load(Ordering::SeqCst) {
-        host.sleep(LOOK);
-        if !host.is_there() {
-            log::error!("klippy has ended: read {}", folder.path.join("klippy.log").display());
+        let passed = host.sleep(LOOK);
+        if ended.load(Ordering::SeqCst) {
+            break;
+        }
+        if passed.is_err() || !host.is_there() {
+            let why = passed.err().unwrap_or(Stop::Ended);
+            log::error!("klippy takes no more turns: {why}: read {}", folder.path.join("klippy.log").display());
             return Ok(Some(false));
         }
     }

@@ -174,6 +174,11 @@ impl<'a> Trial<'a> {
         self.host.until_ready(READY)
     }
 
+    /// Lets time pass. A klippy that takes no more turns does not answer the next question.
+    pub(super) fn sleep(&mut self, span: Duration) {
+        let _ = self.host.sleep(span);
+    }
+
     /// The same for another klippy. Some wait for the user if they find an MCU shut down.
     fn until_ready_again(&mut self) -> Result<(), String> {
         match self.until_ready() {
@@ -219,18 +224,11 @@ impl<'a> Trial<'a> {
     /// Fails if an axis lost steps since then. An axis that homes by its driver's StallGuard has to, and the motors that
     /// share its belts, too.
     pub(super) fn lost_none_since(&self, before: &[(String, u64)]) -> Result<(), Outcome> {
-        let config = self.config();
-        let homes_by_stall =
-            |section: &Section| section.text("endstop_pin").is_some_and(|pin| pin.trim_start().starts_with("tmc"));
-        let kinematics = self.kinematics().unwrap_or_default();
-        let on_belts =
-            |name: &str| kinematics.contains("core") && (kinematics.ends_with("xz") || !name.starts_with('z'));
-        let any = config.sections().iter().any(homes_by_stall);
-        let stalls = |name: &str| {
-            let sections = [format!("stepper_{name}"), name.to_owned()];
-            (any && on_belts(name)) || sections.iter().filter_map(|name| config.section(name)).any(homes_by_stall)
-        };
-        let lost = self.lost().into_iter().zip(before).find(|((name, now), (_, then))| now > then && !stalls(name));
+        let lost = self
+            .lost()
+            .into_iter()
+            .zip(before)
+            .find(|((name, now), (_, then))| now > then && !homes_by_stall(self.config(), name));
         lost.map_or(Ok(()), |((name, now), (_, then))| {
             let cause = format!("axis {name} lost {} steps at an end of its travel", now - then);
             Err(self.failed(cause, self.place(&format!("stepper_{name}"))))
@@ -248,6 +246,16 @@ impl<'a> Trial<'a> {
             Err(_) => Err(self.failed("klippy does not answer", None)),
         }
     }
+}
+
+/// Whether an axis homes by its driver's StallGuard, or shares its belts with one that does. It loses steps then.
+pub(super) fn homes_by_stall(config: &Config, axis: &str) -> bool {
+    let stalls = |section: &Section| section.text("endstop_pin").is_some_and(|pin| pin.trim_start().starts_with("tmc"));
+    let kinematics = config.section("printer").and_then(|section| section.text("kinematics")).unwrap_or_default();
+    let is_on_belts = kinematics.contains("core") && (kinematics.ends_with("xz") || !axis.starts_with('z'));
+    let sections = [format!("stepper_{axis}"), axis.to_owned()];
+    (is_on_belts && config.sections().iter().any(stalls))
+        || sections.iter().filter_map(|name| config.section(name)).any(stalls)
 }
 
 /// The ends of the axes' travel, as klippy says them.

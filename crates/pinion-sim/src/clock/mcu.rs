@@ -60,6 +60,8 @@ struct Connection {
     /// The block that is under way, and the offset of its next command.
     block: Option<(Vec<u8>, usize)>,
     output: Vec<u8>,
+    /// klippy has closed its end.
+    is_over: bool,
 }
 
 /// An MCU and its klippy.
@@ -110,7 +112,9 @@ impl BoardMcu {
             self.mcu.run_workers();
             let ran = self.run_commands();
             if !ran && !self.mcu.has_completion() {
-                return self.give_out();
+                let has_sent = self.give_out();
+                self.connection.take_if(|connection| connection.is_over && connection.block.is_none());
+                return has_sent;
             }
         }
     }
@@ -121,14 +125,15 @@ impl BoardMcu {
             // It fails for no socket.
             let _ = stream.set_nonblocking(true);
             let (receiver, input, output) = (Receiver::default(), Vec::new(), Vec::new());
-            self.connection = Some(Connection { stream, receiver, input, block: None, output });
+            self.connection = Some(Connection { stream, receiver, input, block: None, output, is_over: false });
             self.responses.all().clear();
         }
         let Some(connection) = &mut self.connection else { return };
         let mut piece = [0; 4096];
         while connection.input.len() < INPUT_BYTES_MAX {
             match connection.stream.read(&mut piece) {
-                Ok(0) => return self.connection = None,
+                // What has come before the end still counts.
+                Ok(0) => return connection.is_over = true,
                 Ok(read) => connection.input.extend_from_slice(&piece[..read]),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
@@ -171,6 +176,7 @@ impl BoardMcu {
                 ran = true;
                 if self.mcu.is_finalized() && !was_finalized {
                     self.rests_until = self.clock.now() + CONFIGURES;
+                    break;
                 }
             }
             at = payload.len() - commands.rest().len();

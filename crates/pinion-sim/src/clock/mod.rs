@@ -40,10 +40,14 @@ const HELLO: &[u8; 8] = b"pinion1\0";
 const LOAD: Duration = Duration::from_secs(20);
 /// How long, in real time, klippy may compute until it waits for something.
 const COMPUTE: Duration = Duration::from_secs(120);
+/// How often klippy's process may run another program in its own place.
+const HELLOS_MAX: u32 = 8;
 /// How far klippy's readings of the clock may move it in a turn.
 const READINGS_NS_MAX: u64 = 10_000_000_000;
 /// Time between two calls of a watch: a track of a motor holds half a second of 32,000 steps a second.
 const WATCH: Duration = Duration::from_millis(50);
+/// Turns without so much of the printer's time are no progress.
+const PROGRESS_NS: u64 = 1_000_000;
 /// Real time between two looks whether the program shall end.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -218,6 +222,8 @@ impl OneClock {
         if self.has_stopped {
             return Err(Stop::Ended);
         }
+        let mut progress = (Instant::now(), self.now_ns);
+        let mut turns = 0_u32;
         loop {
             if self.ended.load(Ordering::Relaxed) {
                 return Err(Stop::Asked);
@@ -225,6 +231,13 @@ impl OneClock {
             let player_ns = self.player.as_ref().map_or(u64::MAX, |player| player.until_ns);
             if self.player.is_some() && (self.has_news || self.now_ns >= player_ns) {
                 self.pass_turn()?;
+                turns = turns.wrapping_add(1);
+                if self.now_ns > progress.1 + PROGRESS_NS {
+                    progress = (Instant::now(), self.now_ns);
+                } else if turns.is_multiple_of(1024) && progress.0.elapsed() > COMPUTE {
+                    self.has_stopped = true;
+                    return Err(Stop::Computes);
+                }
                 for mcu in &mut self.mcus {
                     mcu.take_in();
                     self.has_news |= mcu.turn();
@@ -294,7 +307,11 @@ impl OneClock {
         turn[8..].copy_from_slice(&u64::from(self.has_news).to_le_bytes());
         self.has_news = false;
         let given = turn;
-        loop {
+        let _ = player.socket.set_write_timeout(Some(LOOK));
+        for hellos in 0.. {
+            if hellos > HELLOS_MAX {
+                return Err(Stop::Ended);
+            }
             (&player.socket).write_all(&given).map_err(|_| Stop::Ended)?;
             self.receive(&player.socket, &mut turn, Instant::now() + COMPUTE)?;
             // A script has started klippy's Python in its own place.
@@ -304,8 +321,10 @@ impl OneClock {
         }
         let word = |at: usize| u64::from_le_bytes(turn[at..at + 8].try_into().unwrap_or_default());
         // Each reading of the clock takes it some nanoseconds. A printer.cfg is a program, which may say anything.
-        self.now_ns = word(0).clamp(self.now_ns, self.now_ns + READINGS_NS_MAX);
-        set(&self.clock, self.now_ns);
+        let now_ns = word(0).clamp(self.now_ns, self.now_ns + READINGS_NS_MAX);
+        while self.now_ns < now_ns {
+            self.has_news |= self.run_mcus(now_ns);
+        }
         if let Some(player) = &mut self.player {
             player.until_ns = word(8);
         }

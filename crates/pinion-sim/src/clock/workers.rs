@@ -9,6 +9,9 @@ use pinion_firmware::mcu::{Devices, Finished, SentJob, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, TimeSource};
 
+/// Highest number of jobs that wait for a bus. There are at most 256 objects, with one or two jobs each.
+const JOBS_MAX: usize = 1024;
+
 /// The buses. Clones are the same ones: the MCU has one, and its owner asks for the next end.
 #[derive(Clone)]
 pub(super) struct Buses {
@@ -85,6 +88,12 @@ impl Workers for Buses {
     fn submit(&mut self, WorkerId(bus): WorkerId, job: SentJob) -> Result<(), (SentJob, Shutdown)> {
         let mut all = self.all();
         let Some(bus) = all.get_mut(bus) else { return Err((job, no_bus())) };
+        if bus.waiting.len() >= JOBS_MAX {
+            return Err((
+                job,
+                Shutdown::because(reason::WORKER_OVERFLOW, "more is asked of a bus than there are devices"),
+            ));
+        }
         bus.waiting.push_back(job);
         bus.begin(&*self.clock);
         Ok(())

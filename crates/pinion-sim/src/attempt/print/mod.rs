@@ -16,12 +16,13 @@ use std::time::{Duration, Instant};
 use pinion::cli::files::Output;
 use pinion::cli::page::{Page, print};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks};
-use pinion_printer_config::Trouble;
+use pinion_printer_config::{Config, Trouble};
 use pinion_sim::{AskedPath, PathPoint, SimProbe, compare};
 use serde_json::{Value, json};
 
 use super::host::{Host, NoStart};
 use super::time::Time;
+use super::trial::homes_by_stall;
 use super::{Attempt, Form};
 use crate::own::serve::{Folder, Own};
 use file::GcodeFile;
@@ -38,6 +39,8 @@ const COMMAND: Duration = Duration::from_secs(60);
 const STILL: Duration = Duration::from_secs(3600);
 /// When a person resumes a print that has paused.
 const RESUME: Duration = Duration::from_secs(30);
+/// Highest number of lines about unknown commands that are kept.
+const UNKNOWN_MAX: usize = 20;
 /// How often at most.
 const PAUSES_MAX: usize = 100;
 /// A heater is cold if it misses this much of its target.
@@ -101,6 +104,8 @@ pub(crate) fn run(
         pauses: 0,
         line: 1,
         has_begun: false,
+        unknown: Vec::new(),
+        config: &own.config,
     };
     let printed = printing.run();
     let took = began.elapsed();
@@ -164,6 +169,9 @@ struct Print<'a> {
     line: usize,
     /// Filament was laid.
     has_begun: bool,
+    /// What klippy says about commands that it does not know. It goes on then.
+    unknown: Vec<String>,
+    config: &'a Config,
 }
 
 impl Print<'_> {
@@ -178,20 +186,24 @@ impl Print<'_> {
             Ok(()) => self.follow(began).err(),
             Err(words) => Some(words),
         };
+        // What klippy has planned is still on its way.
+        let stopped = stopped.or_else(|| self.finish().err());
         let total_s = self.host.now().saturating_sub(began).as_secs_f64();
-        if stopped.is_none() {
-            // What klippy has planned is still on its way.
-            let _ = self.host.gcode("M400", COMMAND);
-        }
-        self.host.sleep(Duration::from_millis(600));
-        let points = self.path();
+        // The report does not depend on it.
+        let _ = self.host.sleep(Duration::from_millis(600));
+        let (points, trouble) = self.path();
         let asked = AskedPath::read(BufReader::new(self.file.bytes.as_slice()), &self.file.name());
-        let compared = asked.and_then(|asked| compare(&points, &asked)).map_err(|trouble| trouble.to_string());
+        let compared = match trouble {
+            Some(trouble) => Err(trouble),
+            None => asked.and_then(|asked| compare(&points, &asked)).map_err(|trouble| trouble.to_string()),
+        };
         let lost = self.probe.axes().zip(before).map(|(axis, before)| (axis.name.to_owned(), axis.lost_steps - before));
+        let lost = lost.filter(|(axis, steps)| *steps > 0 && !homes_by_stall(self.config, axis)).collect();
         let stopped = stopped.map(|why| Stopped { line: self.line, text: self.file.text(self.line), why });
         let phases = Phase::ALL.map(|phase| {
-            let count = self.samples.iter().filter(|sample| sample.phase == phase).count();
-            (phase, count as f64 * LOOK.as_secs_f64())
+            let starts = std::iter::once(0.0).chain(self.samples.iter().map(|sample| sample.at_s));
+            let of_phase = self.samples.iter().zip(starts).filter(|(sample, _)| sample.phase == phase);
+            (phase, of_phase.map(|(sample, from)| sample.at_s - from).sum())
         });
         Printed {
             file: self.file.name(),
@@ -202,18 +214,33 @@ impl Print<'_> {
             motors: self.host.paces.take().map_or_else(Vec::new, |paces| paces.most().cloned().collect()),
             heaters: self.heaters.clone(),
             compared,
-            lost: lost.filter(|(_, steps)| *steps > 0).collect(),
+            lost,
+            unknown: self.unknown.clone(),
             pauses: self.pauses,
             stopped,
         }
     }
 
-    /// The path that was recorded.
-    fn path(&mut self) -> Vec<PathPoint> {
-        let Some(mut recorder) = self.host.recorder.take() else { return Vec::new() };
+    /// Waits for the end of all motion. M400 ends without an error if klippy stops during it.
+    fn finish(&mut self) -> Result<(), String> {
+        self.host.gcode("M400", STILL).map_err(|refused| refused.to_string())?;
+        match self.host.state().map_err(|refused| refused.to_string())? {
+            (state, _) if state == "ready" => Ok(()),
+            (_, words) => Err(first_line(&words)),
+        }
+    }
+
+    /// The path that was recorded, and why it is not the whole one.
+    fn path(&mut self) -> (Vec<PathPoint>, Option<String>) {
+        let Some(mut recorder) = self.host.recorder.take() else { return (Vec::new(), None) };
         // After a moment without a step the path ends.
         recorder.read(Clock::from_ticks(self.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
-        recorder.points().to_vec()
+        let trouble = match recorder.gaps() {
+            _ if recorder.is_full() => Some("the path was too long, so its end is missing".to_owned()),
+            0 => None,
+            gaps => Some(format!("the path has {gaps} gaps")),
+        };
+        (recorder.points().to_vec(), trouble)
     }
 
     /// Starts the print, and follows it to its end. The error is why it stopped.
@@ -227,16 +254,23 @@ impl Print<'_> {
         let (mut still_since, mut last) = (self.host.now(), (0, [0.0; 3]));
         let mut paused_since = None;
         loop {
-            self.host.sleep(LOOK);
+            self.host.sleep(LOOK).map_err(|stop| format!("klippy is gone: {stop}"))?;
             let heaters: Vec<String> = self.heaters.iter().map(|heater| heater.name.clone()).collect();
             let more = ["print_stats", "virtual_sdcard", "toolhead", "motion_report", "webhooks"];
             let objects: Vec<&str> = heaters.iter().map(String::as_str).chain(more).collect();
             let status = self.host.query(&objects).map_err(|refused| refused.to_string())?;
             let offset = status["virtual_sdcard"]["file_position"].as_u64().unwrap_or_default();
             let state = status["print_stats"]["state"].as_str().unwrap_or_default().to_owned();
-            if state != "complete" {
-                self.line = self.file.line_at(offset);
+            match state.as_str() {
+                "complete" => {}
+                // A print that is cancelled from elsewhere has no place any more.
+                "cancelled" | "standby" if offset == 0 => {}
+                // The place behind the line that has cancelled it.
+                "cancelled" => self.line = self.file.line_at(offset - 1),
+                _ => self.line = self.file.line_at(offset),
             }
+            let unknown = self.host.said.drain(..).filter(|line| line.contains("Unknown command:"));
+            self.unknown.extend(unknown.take(UNKNOWN_MAX.saturating_sub(self.unknown.len())));
             if status["webhooks"]["state"] != "ready" {
                 return Err(first_line(status["webhooks"]["state_message"].as_str().unwrap_or_default()));
             }
@@ -253,7 +287,7 @@ impl Print<'_> {
                         if self.pauses > PAUSES_MAX {
                             return Err(format!("it has paused {} times", self.pauses));
                         }
-                        self.host.gcode("RESUME", COMMAND).map_err(|refused| refused.to_string())?;
+                        self.host.gcode("RESUME", STILL).map_err(|refused| refused.to_string())?;
                     }
                 }
                 _ => paused_since = None,

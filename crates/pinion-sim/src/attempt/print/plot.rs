@@ -11,7 +11,7 @@ const HEIGHT: f64 = 160.0;
 const LEFT: f64 = 70.0;
 const TOP: f64 = 30.0;
 const GAP: f64 = 40.0;
-/// A curve has at most so many points, each the highest of its span.
+/// Highest number of points of a curve. Each is the highest of its span.
 const POINTS_MAX: usize = 1800;
 const COLORS: [&str; 6] = ["#d0342c", "#1f6fb2", "#2b8a3e", "#9c36b5", "#b86e00", "#495057"];
 

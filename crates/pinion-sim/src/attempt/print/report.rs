@@ -45,7 +45,7 @@ impl Heated {
     }
 }
 
-/// The end of a print that did not come to its own.
+/// Why and where a print stopped early.
 #[derive(Clone, Debug)]
 pub(super) struct Stopped {
     pub(super) line: usize,
@@ -66,6 +66,8 @@ pub(super) struct Printed {
     pub(super) compared: Result<Comparison, String>,
     /// Axes that lost steps.
     pub(super) lost: Vec<(String, u64)>,
+    /// What klippy said about commands that it does not know.
+    pub(super) unknown: Vec<String>,
     pub(super) pauses: usize,
     pub(super) stopped: Option<Stopped>,
 }
@@ -131,11 +133,14 @@ impl Printed {
             )),
             Err(why) => page.line(format_args!("the motors' path was not compared with the file's: {why}")),
         }
+        for line in &self.unknown {
+            page.line(format_args!("klippy: {line}"));
+        }
         for (axis, steps) in &self.lost {
             page.line(format_args!("{axis} lost {steps} steps at an end of its travel"));
         }
         page.line(format_args!(
-            "{} of the printer took {} here. A host that is late is no part of it: see pinion latency",
+            "{} of the printer took {} here. This does not show whether a host is fast enough: run pinion latency",
             span(*total_s),
             span(took.as_secs_f64())
         ));
@@ -178,6 +183,7 @@ impl Printed {
             })),
             "lost_steps": self.lost.iter().map(|(axis, steps)| (axis.clone(), json!(steps)))
                 .collect::<serde_json::Map<String, Value>>(),
+            "unknown_commands": self.unknown,
             "stopped": self.stopped.as_ref().map(|stopped| json!({
                 "line": stopped.line,
                 "text": stopped.text,

@@ -80,7 +80,7 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
             Some(n) if trial.host.now() > until => {
                 return Err(trial.failed(format!("{} is off and does not cool", objects[n]), None));
             }
-            Some(_) => trial.host.sleep(Duration::from_millis(500)),
+            Some(_) => trial.sleep(Duration::from_millis(500)),
         }
     }
 }
@@ -111,7 +111,7 @@ fn heat(trial: &mut Trial<'_>, targets: &[(String, f64)]) -> Result<(), Outcome>
             let cause = format!("{name} is at {:.0} of {target} C", celsius(&status, name));
             return Err(trial.failed(cause, trial.place(name)));
         }
-        trial.host.sleep(Duration::from_millis(500));
+        trial.sleep(Duration::from_millis(500));
     }
 }
 

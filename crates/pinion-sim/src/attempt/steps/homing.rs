@@ -62,9 +62,8 @@ fn is_plain(trial: &Trial<'_>, axis: usize) -> bool {
     let of_z = ["bed_tilt", "axis_twist_compensation", "z_tilt", "z_tilt_ng", "quad_gantry_level"];
     let has = |name: &&str| trial.config().section(name).is_some();
     let simple = ["cartesian", "corexy", "corexz", "delta", "hybrid_corexy", "hybrid_corexz"];
-    !has(&"skew_correction")
-        && !(axis == 2 && of_z.iter().any(has))
-        && trial.kinematics().is_some_and(|kinematics| simple.contains(&kinematics))
+    let is_bent = has(&"skew_correction") || axis == 2 && of_z.iter().any(has);
+    !is_bent && trial.kinematics().is_some_and(|kinematics| simple.contains(&kinematics))
 }
 
 /// Moves the second carriage, and checks where its motor is.

@@ -26,7 +26,7 @@ pub(super) fn fans(trial: &mut Trial<'_>) -> Seen {
                 let place = trial.place(name).or_else(|| trial.place(&format!("fan_generic {name}")));
                 return Err(trial.failed(format!("{on}: the fan stands still"), place));
             }
-            trial.host.sleep(Duration::from_millis(50));
+            trial.sleep(Duration::from_millis(50));
         }
         trial.gcode(off, LONG)?;
     }

@@ -115,7 +115,7 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
 fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
     trial.host.recorder = Some(trial.probe.recorder());
     let printed = print(trial);
-    trial.host.sleep(Duration::from_millis(600));
+    trial.sleep(Duration::from_millis(600));
     let Some(mut recorder) = trial.host.recorder.take() else {
         return Err(trial.failed("the path was not recorded", None));
     };
