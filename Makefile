@@ -7,6 +7,7 @@ CARGO_TARGET_DIR ?= target
 PINION = $(CARGO_TARGET_DIR)/release/pinion
 # Beside it: the simulated printer.
 PINION_SIM = $(dir $(PINION))pinion-sim
+CLOCK = $(dir $(PINION))deps/libpinion_clock.so
 # Options for `pinion sim`, such as ARGS="-I /tmp/klipper_host_sim".
 ARGS ?=
 # Root may run in real time: what else the computer does then delays no step.
@@ -242,6 +243,7 @@ install-program:
 # The simulated printer, for computers without pins, too.
 install-sim:
 	install -D -m 755 '$(PINION_SIM)' $(DESTDIR)$(PREFIX)/bin/pinion-sim
+	install -D -m 644 '$(CLOCK)' $(DESTDIR)$(PREFIX)/lib/pinion-sim/libpinion_clock.so
 	install -D -m 644 man/pinion-sim.1 $(DESTDIR)$(MANDIR)/man1/pinion-sim.1
 	install -d $(DESTDIR)$(BASHDIR) $(DESTDIR)$(ZSHDIR) $(DESTDIR)$(FISHDIR)
 	'$(COMPLETER)' sim completions bash >$(DESTDIR)$(BASHDIR)/pinion-sim
@@ -279,7 +281,7 @@ ifeq ($(DESTDIR),)
 	    systemctl disable --now $$unit; \
 	done
 endif
-	rm -rf $(DESTDIR)$(DOCDIR)/guide
+	rm -rf $(DESTDIR)$(DOCDIR)/guide $(DESTDIR)$(PREFIX)/lib/pinion-sim
 	-rmdir --ignore-fail-on-non-empty $(DESTDIR)$(DOCDIR)
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(PREFIX)/bin/pinion-sim $(DESTDIR)$(MANDIR)/man1/pinion-sim.1 \
 	    $(DESTDIR)$(BASHDIR)/pinion-sim $(DESTDIR)$(ZSHDIR)/_pinion-sim $(DESTDIR)$(FISHDIR)/pinion-sim.fish \

@@ -2,21 +2,22 @@
 //! The files that a command line names: to read, and to write.
 //!
 //! The files may come from anybody. Only regular files are opened, so no FIFO blocks and no device notices. An output
-//! replaces the file at its place when it is whole: a command that fails leaves the old file, or none. A link of another
-//! user leads no output anywhere: root's command would change that user's choice of files.
+//! replaces the file at its place when it is whole: a command that fails, or is killed, leaves the old file, or none. A link
+//! of another user leads no output anywhere: root's command would change that user's choice of files.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fmt::Display;
 use std::fs::{self, File, Metadata, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read};
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
 
 use nix::unistd::{AccessFlags, access, geteuid};
 
 use pinion_linux::foreign;
 use pinion_linux::own_folder::{PathEnd, below, end_of_path};
+use pinion_printer_config::{NAMES_MAX, names_in};
 
 const MIB: u64 = 1 << 20;
 /// How many names of a new file are tried.
@@ -56,8 +57,8 @@ pub struct Output {
     path: PathBuf,
     folder: OwnedFd,
     name: OsString,
-    /// The permissions of the file that it replaces.
-    mode: Option<u32>,
+    /// Our own file that it replaces.
+    old: Option<Metadata>,
 }
 
 impl Output {
@@ -88,15 +89,10 @@ impl Output {
             return Err(io::Error::other("it is not a regular file"));
         }
         // Another user's file is replaced by ours. Its permissions are that user's choice.
-        let own = there.as_ref().filter(|there| there.uid() == geteuid().as_raw());
-        let mode = own.map(|there| there.mode() & 0o777);
-        let output = Output { path: path.to_owned(), folder, name, mode };
+        let old = there.clone().filter(|there| there.uid() == geteuid().as_raw());
+        let output = Output { path: path.to_owned(), folder, name, old };
         access(&below(&output.folder), AccessFlags::W_OK | AccessFlags::X_OK)?;
         Ok((output, there))
-    }
-
-    fn at(&self, name: impl AsRef<Path>) -> PathBuf {
-        below(&self.folder).join(name)
     }
 
     /// Writes the file: beside its place, then over it. If it cannot replace what is there, it stays beside it.
@@ -105,36 +101,12 @@ impl Output {
     ///
     /// One line with the file, the cause and the remedy.
     pub fn write<T>(&self, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<T>) -> Result<T, String> {
-        let failed = |error: io::Error| unwritable(&self.path, &error);
-        let (name, file) = self.beside().map_err(failed)?;
-        let fresh = self.at(&name);
-        let put = || {
-            let mut out = BufWriter::new(file);
-            let written = write(&mut out)?;
-            let file = out.into_inner()?;
-            if let Some(mode) = self.mode {
-                file.set_permissions(Permissions::from_mode(mode))?;
+        replace(&below(&self.folder), &self.name, self.old.as_ref(), write).map_err(|unwritten| match unwritten {
+            Unwritten::Failed(error) => unwritable(&self.path, &error),
+            Unwritten::Beside(name, error) => {
+                format!("{} cannot be replaced: {error}: take what is in {name} beside it", self.path.display())
             }
-            Ok(written)
-        };
-        let written = put().inspect_err(|_| drop(fs::remove_file(&fresh))).map_err(failed)?;
-        fs::rename(&fresh, self.at(&self.name)).map_err(|error| {
-            let place = self.path.display();
-            format!("{place} cannot be replaced: {error}: take what is in {name} beside it")
-        })?;
-        Ok(written)
-    }
-
-    /// A new file in the same folder, with its name. A program that was killed may have left some.
-    fn beside(&self) -> io::Result<(String, File)> {
-        let mut tries = 0;
-        loop {
-            let name = format!(".pinion.{}.{tries}", std::process::id());
-            match OpenOptions::new().write(true).create_new(true).open(self.at(&name)) {
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists && tries < TRIES => tries += 1,
-                opened => return opened.map(|file| (name, file)),
-            }
-        }
+        })
     }
 
     /// Makes the file now, empty, for what comes bit by bit.
@@ -143,17 +115,81 @@ impl Output {
     ///
     /// One line with the file, the cause and the remedy.
     pub fn make(&self) -> Result<File, String> {
-        let failed = |error: io::Error| unwritable(&self.path, &error);
-        let (name, file) = self.beside().map_err(failed)?;
-        fs::rename(self.at(&name), self.at(&self.name))
-            .inspect_err(|_| drop(fs::remove_file(self.at(&name))))
-            .map_err(failed)?;
-        Ok(file)
+        let folder = below(&self.folder);
+        let made = beside(&folder, &self.name, None).and_then(|(name, file)| {
+            let renamed = fs::rename(folder.join(&name), folder.join(&self.name));
+            renamed.inspect_err(|_| drop(fs::remove_file(folder.join(&name)))).map(|()| file)
+        });
+        made.map_err(|error| unwritable(&self.path, &error))
     }
 
     /// The file, as the command line names it.
     pub fn path(&self) -> impl Display {
         self.path.display()
+    }
+}
+
+/// Why a file was not replaced.
+pub(super) enum Unwritten {
+    /// It is as it was.
+    Failed(io::Error),
+    /// The new contents are in this file beside it.
+    Beside(String, io::Error),
+}
+
+/// Writes a file beside its place in a folder, then over it. The owner, the group and the permissions of `old` stay.
+pub(super) fn replace<T>(
+    folder: &Path,
+    name: &OsStr,
+    old: Option<&Metadata>,
+    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<T>,
+) -> Result<T, Unwritten> {
+    let (fresh, file) = beside(folder, name, old).map_err(Unwritten::Failed)?;
+    let put = || {
+        let mut out = BufWriter::new(file);
+        let written = write(&mut out)?;
+        let file = out.into_inner()?;
+        if let Some(old) = old {
+            // A FAT file system has neither owners nor modes to set.
+            let _ = fchown(&file, Some(old.uid()), Some(old.gid()));
+            let _ = file.set_permissions(Permissions::from_mode(old.mode() & 0o777));
+        }
+        file.sync_all()?;
+        Ok(written)
+    };
+    let written = put().inspect_err(|_| drop(fs::remove_file(folder.join(&fresh)))).map_err(Unwritten::Failed)?;
+    if let Err(error) = fs::rename(folder.join(&fresh), folder.join(name)) {
+        return Err(Unwritten::Beside(fresh, error));
+    }
+    // The file is written, whether or not the name outlasts a loss of power.
+    let _ = File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(written)
+}
+
+/// The beginning of the names of new files beside a file.
+fn fresh(name: &OsStr) -> String {
+    format!(".{}.pinion.", name.to_string_lossy())
+}
+
+/// A new file beside another one, with its name. Nobody else may read it before it has the permissions of `old`.
+pub(super) fn beside(folder: &Path, name: &OsStr, old: Option<&Metadata>) -> io::Result<(String, File)> {
+    let mode = if old.is_some() { 0o600 } else { 0o666 };
+    let mut tries = 0;
+    loop {
+        let name = format!("{}{}.{tries}", fresh(name), std::process::id());
+        match OpenOptions::new().write(true).create_new(true).mode(mode).open(folder.join(&name)) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists && tries < TRIES => tries += 1,
+            opened => return opened.map(|file| (name, file)),
+        }
+    }
+}
+
+/// Removes the new files that killed programs have left beside a file.
+pub(super) fn sweep(folder: &Path, name: &OsStr) {
+    let beginning = fresh(name);
+    for name in names_in(folder, NAMES_MAX).iter().filter(|name| name.starts_with(&beginning)) {
+        // As a rule there is none.
+        let _ = fs::remove_file(folder.join(name));
     }
 }
 

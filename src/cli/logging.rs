@@ -161,9 +161,17 @@ enum Style {
     Journal,
     /// For people: with the level and the time in seconds of CLOCK_MONOTONIC. The MCU's own clock runs by it too.
     Plain,
+    /// For the user of a command that serves no host: with the level, as an error in the command line has it.
+    Command,
 }
 
 impl Style {
+    /// The journal's, or this one.
+    fn for_stderr(other: Style) -> Style {
+        let is_journal = std::env::var("JOURNAL_STREAM").is_ok_and(|journal| is_same(&journal, io::stderr().as_fd()));
+        if is_journal { Style::Journal } else { other }
+    }
+
     fn line(self, level: Level, text: fmt::Arguments<'_>) -> String {
         let text = text.to_string();
         // A line feed in a name would begin a new line, and with `<0>` a line of any priority.
@@ -182,15 +190,14 @@ impl Style {
                 let now = monotonic().as_secs_f64();
                 format!("[{now:12.6}] {level:5} {text}\n")
             }
+            Style::Command => format!("{}: {text}\n", level.as_str().to_lowercase()),
         }
     }
 }
 
 impl Stderr {
     fn style(&self) -> Style {
-        let for_journal =
-            || std::env::var("JOURNAL_STREAM").is_ok_and(|journal| is_same(&journal, io::stderr().as_fd()));
-        *self.style.get_or_init(|| if for_journal() { Style::Journal } else { Style::Plain })
+        *self.style.get_or_init(|| Style::for_stderr(Style::Plain))
     }
 
     /// Locks the queue. Nobody holds the lock while writing to stderr, so this does not wait for long.
@@ -280,6 +287,12 @@ pub fn start(level: LevelFilter) {
     log::set_max_level(level);
 }
 
+/// The same for a command that serves no host.
+pub fn start_command(level: LevelFilter) {
+    let _ = STDERR.style.set(Style::for_stderr(Style::Command));
+    start(level);
+}
+
 /// Starts the thread that writes, so that no other thread waits for a reader of stderr. Call it after the guardian is
 /// forked, because a process with threads cannot be forked.
 pub fn detach() {
@@ -350,7 +363,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_line_is_one_line_whatever_is_named_in_it(name in any_name()) {
-            for style in [Style::Journal, Style::Plain] {
+            for style in [Style::Journal, Style::Plain, Style::Command] {
                 assert_plain(&style.line(Level::Warn, format_args!("the host is klippy of {name}")), 1);
             }
         }

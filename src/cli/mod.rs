@@ -4,7 +4,7 @@
 use std::ffi::OsString;
 use std::fs::Metadata;
 use std::os::unix::fs::FileTypeExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand, ValueHint};
@@ -123,7 +123,10 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    logging::start(cli.log.level());
+    match cli.command {
+        None | Some(Command::Run(_) | Command::Link(_) | Command::Attach(_)) => logging::start(cli.log.level()),
+        Some(_) => logging::start_command(cli.log.level()),
+    }
     let status = match cli.command {
         None => run::run(&cli.run, cli.log.log_level, take_over),
         Some(Command::Run(args)) => run::run(&args, cli.log.log_level, take_over),
@@ -138,7 +141,11 @@ pub fn main() -> ExitCode {
         Some(Command::Link(args)) => link::run(&args),
         Some(Command::Attach(args)) => attach::run(&args),
         Some(Command::Sim { arguments }) => sim(&arguments, &cli.log),
-        Some(Command::Completions { shell }) => completions(&mut Cli::command(), shell),
+        Some(Command::Completions { shell }) => {
+            // pinion-sim knows the options behind `pinion sim`. Without it, a shell offers files there.
+            let _ = simulator::start(&["completions".into(), "--all".into(), shell.to_string().into()]);
+            completions(&mut Cli::command(), shell)
+        }
     };
     logging::finish();
     status
@@ -159,6 +166,24 @@ fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run:
 fn sim(arguments: &[OsString], log: &LogArgs) -> ExitCode {
     let level = log.log_level.map(|level| format!("--log-level={level}").into());
     failed(simulator::start(&level.into_iter().chain(arguments.iter().cloned()).collect::<Vec<_>>()))
+}
+
+/// The command line of `pinion`, with that of `pinion-sim` behind `pinion sim`.
+pub fn with_simulator(simulator: clap::Command) -> clap::Command {
+    Cli::command().mut_subcommand("sim", |own| {
+        let about = own.get_about().cloned().unwrap_or_default();
+        simulator.name("sim").about(about)
+    })
+}
+
+/// The checkout of the only klippy that this computer has.
+pub fn klipper_here() -> Option<PathBuf> {
+    let klippys = computer::klippy::klippys(&computer::Computer::at(Path::new("/"))).into_iter();
+    // What a process sees below its own root is not here.
+    let folders = klippys.filter_map(|klippy| klippy.folder).filter(|folder| !folder.starts_with("/proc"));
+    let mut folders: Vec<PathBuf> = folders.filter_map(|folder| Some(folder.parent()?.to_owned())).collect();
+    folders.dedup();
+    if folders.len() == 1 { folders.pop() } else { None }
 }
 
 /// Prints the script for a shell.

@@ -17,7 +17,10 @@ pub fn share(folder: &Path) -> Result<(), String> {
     // The program that cargo has built for all tests.
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
     strip(pinion, "pinion")?;
-    strip(simulator::beside(pinion), "pinion-sim")?;
+    let simulator = simulator::beside(pinion);
+    strip(simulator, "pinion-sim")?;
+    fs::create_dir_all(folder.join("deps")).map_err(|error| error.to_string())?;
+    strip(&simulator.with_file_name("deps/libpinion_clock.so"), "deps/libpinion_clock.so")?;
     strip(&host(tree)?, "host")?;
     process::run(
         Command::new(tree.join("scripts/build-deb"))
@@ -48,7 +51,8 @@ pub fn share(folder: &Path) -> Result<(), String> {
     // The files for `make install`, with the program that is already built.
     process::pipeline(
         r#"cd "$1"; tar -c Makefile systemd udev man docs/guide | tar -x -C "$2" --one-top-level=tree
-           install -D -t "$2/tree/target/release" "$2/pinion" "$2/pinion-sim""#,
+           install -D -t "$2/tree/target/release" "$2/pinion" "$2/pinion-sim"
+           install -D -t "$2/tree/target/release/deps" "$2/deps/libpinion_clock.so""#,
         &[&tree.display().to_string(), &folder.display().to_string()],
     )
 }

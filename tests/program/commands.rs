@@ -343,6 +343,8 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         ("status --log-level de", "debug"),
         ("console --board ''", "sim"),
         ("run --cpu ''", ""),
+        ("sim --print-b", "--print-board"),
+        ("sim --compar", "--compare"),
     ] {
         let last = words.split(' ').count();
         let ask = format!(

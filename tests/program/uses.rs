@@ -585,6 +585,45 @@ fn config_txt_stays_if_printer_cfg_cannot_change() {
     assert_eq!(card.snapshot(), before);
 }
 
+/// An undo asks both sides first, too.
+#[test]
+fn an_undo_changes_no_file_if_another_one_cannot_change() {
+    let card = Card::pi();
+    card.added(&["adxl345", "--yes"]);
+    fs::set_permissions(card.path("boot/firmware/config.txt"), fs::Permissions::from_mode(0o444)).unwrap();
+    let before = card.snapshot();
+    let log = card.refused(&["adxl345", "--undo", "--yes"]);
+    assert!(log.contains("config.txt is read-only: chmod u+w "), "{log}");
+    assert_eq!(card.snapshot(), before);
+}
+
+#[test]
+fn a_link_that_leads_nowhere_is_found_before_the_bus_is_enabled() {
+    let card = Card::pi();
+    symlink("/home/pi/gone", card.path(&card.beside("pinion"))).unwrap();
+    let log = card.refused(&["adxl345", "--yes"]);
+    assert!(log.contains(&format!("/{} is a link that leads nowhere: remove it", card.beside("pinion"))), "{log}");
+    assert_eq!(card.read("boot/firmware/config.txt"), CONFIG_TXT);
+    assert!(!card.path("home/pi/gone").exists());
+}
+
+/// A mounted card has no device tree.
+#[test]
+fn the_doctor_is_told_the_board_of_a_card() {
+    let card = Card::pi().with_config_txt("[pi4]\ndtoverlay=gpio-fan,gpiopin=17\n").with_printer(HOST);
+    fs::remove_dir_all(card.path("proc")).unwrap();
+    card.put(PRINTER, &format!("{PRINTER_CFG}{HOST}[output_pin lamp]\npin: host:GPIO17\n"));
+    let root = card.root();
+    let doctor = |board: &str| output(&["doctor", "--root", &root, "--board", board]);
+    let found = String::from_utf8(doctor("raspberry-pi-4").stdout).unwrap();
+    assert!(found.contains("GPIO17 (pin 11) is used twice: by [output_pin lamp]"), "{found}");
+    assert!(found.contains("SPI: off") && found.contains("dtparam=spi=on"), "{found}");
+    assert!(!String::from_utf8(doctor("raspberry-pi-5").stdout).unwrap().contains("used twice"));
+    let refused = doctor("raspberry-pi-9");
+    let log = String::from_utf8_lossy(&refused.stderr);
+    assert!(log.starts_with("error: --board: there is no board \"raspberry-pi-9\": choose one of rasp"), "{log}");
+}
+
 /// The user's printer.cfg includes a file of root's. One line is no option, so klippy's error quotes it.
 #[test]
 fn root_s_commands_print_no_line_that_the_owner_of_printer_cfg_may_not_read() {

@@ -26,6 +26,8 @@ const BELTS: [Rgb; 2] = [[86, 156, 255], [255, 120, 170]];
 pub const LOST: Rgb = [255, 64, 64];
 const PROBE: Rgb = [228, 232, 240];
 const PIN: Rgb = [200, 80, 210];
+/// Most parked carriages that are drawn.
+const PARKED_MAX: usize = 4;
 /// How far a push-pin goes up.
 const PIN_MM: f64 = 7.0;
 
@@ -220,14 +222,17 @@ impl Printer {
         }
     }
 
-    /// Draws the strips of lights.
-    pub fn draw_lights(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene) {
+    /// Draws the strips of lights. In a near view, which does not have their place, they are along its lower edge.
+    pub fn draw_lights(&self, canvas: &mut Canvas, lens: &Lens, scene: &Scene, near: Option<[f64; 4]>) {
         for (row, strip) in scene.strips.iter().enumerate().take(2) {
             let count = strip.lights.len().max(1) as f64;
             for (index, color) in strip.lights.iter().enumerate() {
-                let at = self.light((index as f64 + 0.5) / count, row);
+                let part = (index as f64 + 0.5) / count;
                 let radius = (110.0 / count).clamp(1.5, 5.5);
-                let place = lens.place(at);
+                let place = match near {
+                    Some(area) => light_near(area, part, row),
+                    None => lens.place(self.light(part, row)),
+                };
                 let brightness = f64::from(*color.iter().max().unwrap_or(&0)) / 255.0;
                 canvas.circle(place, radius, [20, 22, 26], 1.0);
                 if brightness > 0.0 {
@@ -310,6 +315,10 @@ impl Printer {
             }
             belt(canvas, &[[x0, behind, top], [x1, behind, top]], BELTS[1]);
             canvas.solid(lens, &motor([x0 + 8.0, behind, z + 4.0]), MOTOR, 1.0);
+        }
+        for parked in scene.parked_mm.iter().take(PARKED_MAX) {
+            let heaters = scene.heaters.clone();
+            self.draw_head(canvas, lens, &Scene { nozzle_mm: *parked, heaters, ..Scene::default() }, &[]);
         }
         self.draw_head(canvas, lens, scene, turns);
     }
@@ -406,6 +415,11 @@ impl Printer {
             draw_probe(canvas, lens, scene.nozzle_mm, probe);
         }
     }
+}
+
+/// The place of a light in a near view of this area: left, top, right and bottom.
+pub fn light_near([left, _, right, bottom]: [f64; 4], part: f64, row: usize) -> [f64; 2] {
+    [left + (right - left) * part, bottom - 10.0 - 16.0 * row as f64]
 }
 
 /// How hot the hot ends are, 0 to 1.

@@ -140,9 +140,14 @@ impl Picture {
         let canvas = &mut sheet.canvas;
         canvas.pixmap.data_mut().copy_from_slice(sheet.still.pixmap.data());
         self.printer.draw_heat(canvas, &sheet.lens, scene);
-        self.printer.draw_lights(canvas, &sheet.lens, scene);
+        if view.is_none() {
+            self.printer.draw_lights(canvas, &sheet.lens, scene, None);
+        }
         canvas.overlay(&sheet.laid);
         self.printer.draw_moving(canvas, &sheet.lens, scene, &self.turns, view.is_some());
+        if view.is_some() {
+            self.printer.draw_lights(canvas, &sheet.lens, scene, Some(layout.area()));
+        }
         sheet.panel.draw(canvas, scene, &self.turns);
     }
 

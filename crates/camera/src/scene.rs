@@ -57,6 +57,8 @@ pub struct Scene {
     pub is_shut_down: bool,
     /// The position of the nozzle: x, y and z.
     pub nozzle_mm: [f64; 3],
+    /// The positions of the nozzles of other carriages, which do not print.
+    pub parked_mm: Vec<[f64; 3]>,
     /// The motors.
     pub axes: Vec<Axis>,
     /// The heaters.
@@ -84,7 +86,7 @@ pub struct Axis {
     pub name: String,
     /// Its position.
     pub position_mm: f64,
-    /// Steps that it could not make.
+    /// Steps that it could not make, and should have made.
     pub lost_steps: u64,
 }
 

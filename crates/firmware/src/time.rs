@@ -79,6 +79,11 @@ pub trait TimeSource: Send + Sync {
         }
     }
 
+    /// Sleeps until about `end`. A clock that stands still does not wait for itself.
+    fn sleep_until(&self, end: Clock) {
+        std::thread::sleep(self.duration_of(end).saturating_sub(self.duration_of(self.now())));
+    }
+
     /// How far apart two successive values of the clock are, in nanoseconds, before they are rounded down to ticks.
     fn step_ns(&self) -> u32 {
         1
@@ -191,6 +196,9 @@ impl TimeSource for VirtualClock {
     fn spin_until(&self, end: Clock) {
         self.set(end);
     }
+
+    /// Somebody else moves the clock.
+    fn sleep_until(&self, _end: Clock) {}
 
     /// The work runs in a time that begins now, as on another thread. The clock itself does not advance.
     fn run_job(&self, work: &mut dyn FnMut()) -> Clock {

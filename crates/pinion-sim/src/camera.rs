@@ -35,6 +35,10 @@ const LAYER_MM: f64 = 0.05;
 const JERK_S: f64 = 0.05;
 /// Points of a path that are kept during a pause: what is drawn needs none.
 const POINTS: usize = 10_000;
+/// Longest part of an axis that a picture shows.
+const LONGEST_MM: f64 = 1000.0;
+/// The axis of the second carriage of an IDEX printer.
+const SECOND_CARRIAGE: &str = "dual_carriage";
 /// The color of a light that has only one.
 const WARM_WHITE: Rgb = [255, 240, 205];
 /// The picture's extent for a printer without a bed.
@@ -52,6 +56,8 @@ pub(crate) fn parse(text: &str) -> Result<String, String> {
 struct Subject {
     gantry: Gantry,
     probes: Vec<Probe>,
+    /// The axes that find their ends by stalling. They lose steps there on purpose.
+    stalling: Vec<String>,
 }
 
 impl Subject {
@@ -61,23 +67,28 @@ impl Subject {
             None if config.corexy => Gantry::CoreXy,
             None => Gantry::Cartesian,
         };
-        Subject { gantry, probes: config.parts.iter().filter_map(probe).collect() }
+        let stalling = config.parts.iter().filter_map(stalling).map(str::to_owned).collect();
+        Subject { gantry, probes: config.parts.iter().filter_map(probe).collect(), stalling }
     }
 }
 
 fn printer(gantry: Gantry, sim: &SimProbe) -> Printer {
     let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
-    Printer { bed: shape(bed), height_mm, gantry }
+    Printer { bed: shape(bed), height_mm: height_mm.min(LONGEST_MM), gantry }
 }
 
 /// A JPEG of the printer now, with the filament that this recorder saw. `None` without memory for it.
 pub(crate) fn picture(config: &SimConfig, sim: &SimProbe, recorder: Recorder) -> Option<Vec<u8>> {
-    let Subject { gantry, probes } = Subject::new(config);
+    let Subject { gantry, probes, stalling } = Subject::new(config);
     let laid = Arc::new(Mutex::new(Vec::new()));
     Filament { recorder, ..Filament::new(sim.clone(), laid.clone()) }.read();
     let laid = std::mem::take(&mut *laid.lock().unwrap_or_else(PoisonError::into_inner));
     let mut picture = Picture::new(printer(gantry, sim))?;
-    let scene = Scene { laid, ..scene(sim, &probes, &Targets::default()) };
+    let mut scene = Scene { laid, ..scene(sim, &probes, &Targets::default()) };
+    // Nobody knows by now which of their steps were lost in a print.
+    for axis in scene.axes.iter_mut().filter(|axis| stalling.contains(&axis.name)) {
+        axis.lost_steps = 0;
+    }
     picture.take(&scene);
     picture.draw(&scene, Layout::Wide);
     Some(picture.jpeg(Layout::Wide))
@@ -99,7 +110,7 @@ impl Camera {
     /// Serves the picture from now on, and says where. Call it before this thread runs in real time: the camera's
     /// threads get its scheduling.
     pub(crate) fn start(self, sim: SimProbe, own: OwnStatus) -> Result<(), Trouble> {
-        let Camera { listener, subject: Subject { gantry, probes } } = self;
+        let Camera { listener, subject: Subject { gantry, probes, stalling } } = self;
         let printer = printer(gantry, &sim);
         let address = listener.local_addr().map_err(|error| Trouble::new(error.to_string()).of("--camera"))?;
         let thread = thread::Builder::new().name("camera".into()).spawn(move || {
@@ -114,10 +125,13 @@ impl Camera {
                 Targets::default()
             });
             let start = Instant::now();
+            let mut losses = Losses { stalling, ..Losses::default() };
             let look = move || {
                 let laid = std::mem::take(&mut *laid.lock().unwrap_or_else(PoisonError::into_inner));
                 let (seconds, is_shut_down) = (start.elapsed().as_secs_f64(), own.stop().is_some());
-                Scene { seconds, is_shut_down, laid, ..scene(&sim, &probes, &targets) }
+                let mut scene = Scene { seconds, is_shut_down, laid, ..scene(&sim, &probes, &targets) };
+                losses.keep_of_print(&mut scene);
+                scene
             };
             let thread = thread::Builder::new().name("camera path".into()).spawn(move || {
                 loop {
@@ -242,9 +256,56 @@ fn refusal(error: &std::io::Error) -> Trouble {
     Trouble::new(cause).remedy(remedy)
 }
 
+/// The steps that axes with sensorless homing lose while something is printed. What they lose at their ends is no fault.
+#[derive(Default)]
+struct Losses {
+    stalling: Vec<String>,
+    /// The steps of each that were lost before the print.
+    before: Vec<u64>,
+    /// When something was laid last.
+    laid_at: Option<f64>,
+}
+
+impl Losses {
+    fn keep_of_print(&mut self, scene: &mut Scene) {
+        if !scene.laid.is_empty() {
+            self.laid_at = Some(scene.seconds);
+        }
+        let is_printing = self.laid_at.is_some_and(|at| scene.seconds - at <= PAUSE_S);
+        self.before.resize(self.stalling.len(), 0);
+        for (name, before) in self.stalling.iter().zip(&mut self.before) {
+            let Some(axis) = scene.axes.iter_mut().find(|axis| axis.name == *name) else { continue };
+            if !is_printing {
+                *before = axis.lost_steps;
+            }
+            axis.lost_steps = axis.lost_steps.saturating_sub(*before);
+        }
+    }
+}
+
+/// The axis whose driver reports a stall. `None` for another part.
+fn stalling(part: &PartConfig) -> Option<&str> {
+    let (axis, reports) = match part {
+        PartConfig::Tmc2209(driver) => (&driver.axis, driver.diag_pin.is_some()),
+        PartConfig::Tmc2130(driver) => (&driver.axis, driver.diag0_pin.is_some() || driver.diag1_pin.is_some()),
+        PartConfig::Tmc2240(driver) => (&driver.axis, driver.diag0_pin.is_some() || driver.diag1_pin.is_some()),
+        PartConfig::Tmc2240Uart(driver) => (&driver.axis, driver.diag0_pin.is_some() || driver.diag1_pin.is_some()),
+        PartConfig::Tmc5160(driver) => (&driver.axis, driver.diag0_pin.is_some() || driver.diag1_pin.is_some()),
+        _ => return None,
+    };
+    reports.then_some(axis)
+}
+
+/// The end of an axis in the picture. That of a belt may be kilometers away.
+fn near(from_mm: f64, to_mm: f64) -> [f64; 2] {
+    [from_mm, to_mm.min(from_mm + LONGEST_MM)]
+}
+
 fn shape(bed: BedShape) -> Bed {
     match bed {
-        BedShape::Rectangle { min_mm: [x0, y0], max_mm: [x1, y1] } => Bed::Rectangle { x_mm: [x0, x1], y_mm: [y0, y1] },
+        BedShape::Rectangle { min_mm: [x0, y0], max_mm: [x1, y1] } => {
+            Bed::Rectangle { x_mm: near(x0, x1), y_mm: near(y0, y1) }
+        }
         BedShape::Disc { radius_mm } => Bed::Disc { radius_mm },
     }
 }
@@ -266,6 +327,7 @@ fn scene(sim: &SimProbe, probes: &[Probe], targets: &Targets) -> Scene {
         let (name, position_mm, lost_steps) = (axis.name.into(), axis.position_mm, axis.lost_steps);
         scene.axes.push(Axis { name, position_mm, lost_steps });
     }
+    scene.parked_mm.extend(parked(&scene));
     for heater in sim.heaters() {
         let (name, target_celsius) = (heater.name.into(), targets.of(heater.name));
         scene.heaters.push(Heater { name, celsius: heater.celsius, target_celsius, on: heater.on });
@@ -279,6 +341,15 @@ fn scene(sim: &SimProbe, probes: &[Probe], targets: &Targets) -> Scene {
         show(&mut scene, name, look);
     }
     scene
+}
+
+/// The nozzle of the carriage of an IDEX printer that does not print: the nozzle's place is that of the other one.
+fn parked(scene: &Scene) -> Option<[f64; 3]> {
+    let position = |name: &str| scene.axes.iter().find(|axis| axis.name == name).map(|axis| axis.position_mm);
+    let (first, second) = (position("x")?, position(SECOND_CARRIAGE)?);
+    let [x, y, z] = scene.nozzle_mm;
+    let is_second = (x - second).abs() < (x - first).abs();
+    Some([if is_second { first } else { second }, y, z])
 }
 
 /// Adds what a part looks like.
@@ -318,4 +389,48 @@ fn show(scene: &mut Scene, part: &str, look: Look) {
 /// The color that an eye sees: the white part adds to all others.
 fn rgb(Colour { red, green, blue, white }: Colour) -> Rgb {
     [red, green, blue].map(|part| part.saturating_add(white))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn axis(name: &str, position_mm: f64, lost_steps: u64) -> Axis {
+        Axis { name: name.into(), position_mm, lost_steps }
+    }
+
+    #[test]
+    fn a_belt_of_kilometers_has_a_picture() {
+        let belt = BedShape::Rectangle { min_mm: [0.0, -5.0], max_mm: [200.0, 20_000_000.0] };
+        assert_eq!(shape(belt), Bed::Rectangle { x_mm: [0.0, 200.0], y_mm: [-5.0, 995.0] });
+    }
+
+    #[test]
+    fn the_carriage_that_does_not_print_is_parked() {
+        let scene = |x: f64| {
+            let axes = vec![axis("x", -10.0, 0), axis("dual_carriage", 250.0, 0)];
+            Scene { nozzle_mm: [x, 5.0, 1.0], axes, ..Scene::default() }
+        };
+        assert_eq!(parked(&scene(-10.0)), Some([250.0, 5.0, 1.0]));
+        assert_eq!(parked(&scene(250.0)), Some([-10.0, 5.0, 1.0]));
+        assert_eq!(parked(&Scene { axes: vec![axis("x", 1.0, 0)], ..Scene::default() }), None);
+    }
+
+    #[test]
+    fn steps_that_sensorless_homing_loses_are_no_fault() {
+        let mut losses = Losses { stalling: vec!["x".into()], ..Losses::default() };
+        let mut shown = |seconds: f64, lost: u64, prints: bool| {
+            let piece = Laid { from_mm: [0.0; 3], to_mm: [1.0; 3], mm_per_s: 1.0, begins: false };
+            let laid = if prints { vec![piece] } else { Vec::new() };
+            let mut scene =
+                Scene { seconds, laid, axes: vec![axis("x", 0.0, lost), axis("y", 0.0, lost)], ..Scene::default() };
+            losses.keep_of_print(&mut scene);
+            [scene.axes[0].lost_steps, scene.axes[1].lost_steps]
+        };
+        assert_eq!(shown(1.0, 40, false), [0, 40], "y has an endstop");
+        assert_eq!(shown(30.0, 40, true), [0, 40]);
+        assert_eq!(shown(31.0, 47, true), [7, 47], "in a print");
+        assert_eq!(shown(32.0, 47, false), [7, 47]);
+        assert_eq!(shown(99.0, 90, false), [0, 90], "homed again");
+    }
 }

@@ -16,12 +16,13 @@ use clap::{CommandFactory as _, Parser, Subcommand};
 use pinion::cli::console::{self, ConsoleArgs};
 use pinion::cli::dict::{self, DictArgs};
 use pinion::cli::run::{self, RunArgs};
-use pinion::cli::{LogArgs, completions, logging};
+use pinion::cli::{LogArgs, completions, logging, with_simulator};
 use printer::SimArgs;
 
 mod attempt;
 mod boards;
 mod camera;
+mod clock;
 mod demo;
 mod description;
 mod own;
@@ -54,6 +55,9 @@ enum Command {
     Completions {
         /// The shell
         shell: clap_complete::Shell,
+        /// Complete pinion's command lines, with those behind pinion sim
+        #[arg(long, hide = true)]
+        all: bool,
     },
 }
 
@@ -65,7 +69,10 @@ fn main() -> ExitCode {
         Some(Command::Run(args)) => run::run(&args, cli.log.log_level, description::open),
         Some(Command::Dict(args)) => dict::run(&args, description::open),
         Some(Command::Console(args)) => console::run(&args, description::open),
-        Some(Command::Completions { shell }) => completions(&mut Cli::command(), shell),
+        Some(Command::Completions { shell, all }) => {
+            let own = Cli::command();
+            completions(&mut if all { with_simulator(own) } else { own }, shell)
+        }
     };
     logging::finish();
     status

@@ -48,6 +48,11 @@ impl OwnStatus {
         Ok(own)
     }
 
+    /// The host's process.
+    pub(crate) fn set_host(&self, pid: u32) {
+        self.set(Facts { stop: None, host: Some(pid) });
+    }
+
     fn set(&self, facts: Facts) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = facts;
     }

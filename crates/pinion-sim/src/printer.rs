@@ -3,12 +3,13 @@
 
 use std::fmt::Display;
 use std::io::{self, IsTerminal};
+use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -16,16 +17,21 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::time::Ticks;
 use pinion_linux::clock::Monotonic;
 use pinion_printer_config::Trouble;
+use pinion_runtime::klippy::Checkout;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
-use crate::attempt::{self, Attempt};
+use crate::attempt::time::Time;
+use crate::attempt::{self, Attempt, Form};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
+use crate::clock::{self, OneClock};
 use crate::description::read;
 use crate::own;
 use crate::own::args::OwnArgs;
@@ -97,14 +103,16 @@ struct Owner {
 impl Owner {
     fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
         let attempt = args.own.attempt()?;
-        let place = Place::make(&own, &args.own, args.symlink.as_deref())?;
+        let is_in_one_clock = attempt.as_ref().is_some_and(|attempt| !attempt.real_time);
+        let link = is_in_one_clock.then(|| PathBuf::from(format!("{}mcu", clock::MCUS)));
+        let place = Place::make(&own, &args.own, link.as_deref().or(args.symlink.as_deref()))?;
         Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
     }
 }
 
 /// A trial runs the programs in a printer.cfg, so root's rights are left before it.
 fn leave_root(args: &SimArgs, printer_cfg: &Path) -> Result<(), Trouble> {
-    if !args.own.attempt {
+    if !args.own.has_klippy() {
         return Ok(());
     }
     attempt::rights::leave_root(printer_cfg, args.own.folder.as_deref(), args.realtime)
@@ -116,11 +124,12 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Some(file) => match leave_root(args, file).and_then(|()| own::run::read(file, &args.own)) {
             Ok(own) => Some(own),
             Err(mistake) if args.own.attempt => return attempt::refused(file, mistake, args.own.form()),
+            Err(mistake) if args.own.form() == Form::Json => return attempt::print::refused(file, &mistake),
             Err(mistake) => return failed(mistake),
         },
         None if args.own.is_used() => {
             return failed(
-                "--try, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
+                "--try, --print, --speed, --built-like, --with, --folder and --in-place-pty need a printer.cfg: name yours before them",
             );
         }
         None => None,
@@ -148,6 +157,11 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(owner) => owner,
         Err(error) => return failed(error),
     };
+    if let Some((owner, attempt)) = owner.as_ref().and_then(|owner| Some((owner, owner.attempt.as_ref()?)))
+        && !attempt.real_time
+    {
+        return run_in_one_clock(args, owner, attempt, config, (path, spi_trace));
+    }
     let links = match &owner {
         Some(owner) => owner.place.links().to_vec(),
         None => boards::links(args.symlink.as_deref().unwrap_or(Path::new(LINK)), &config),
@@ -235,6 +249,81 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }
+}
+
+/// Tries a printer whose klippy has the printer's clock, or prints on it, or serves it.
+fn run_in_one_clock(
+    args: &SimArgs,
+    owner: &Owner,
+    attempt: &Attempt,
+    config: SimConfig,
+    (path, spi_trace): (Option<Files>, Option<Output>),
+) -> ExitCode {
+    let Place::Folder(folder) = &owner.place else { return failed("--try needs a folder") };
+    let ended = match asked_to_end() {
+        Ok(ended) => ended,
+        Err(error) => return failed(error),
+    };
+    let mut record = None;
+    let tried = || {
+        let clock = clock::clock();
+        let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
+        let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
+        let forms = Checkout::read(&attempt.klipper.join("klippy"), FEATURES)
+            .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
+        let shown = OwnStatus::default();
+        camera.map_or(Ok(()), |camera| camera.start(probe.clone(), shown.clone()))?;
+        let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
+        let own = (&owner.own, owner.printer_cfg.as_path());
+        attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
+        if let Some(trace) = spi_trace {
+            probe.record_spi(trace.make()?);
+        }
+        if let Some(files) = path {
+            let path = PathRecord::new(files, probe.clone());
+            one.watch(path.reader());
+            record = Some(path);
+        }
+        let time = Time::One(Box::new(one));
+        let done = match &attempt.print {
+            Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
+            None if attempt.speed.is_some() => {
+                attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?
+            }
+            None => attempt::run(attempt, own, folder, &probe, time, &ended),
+        };
+        match done {
+            Some(passed) => Ok(passed),
+            None if attempt.print.is_some() || attempt.speed.is_some() => Err(alone(&attempt.python)),
+            None => Err(in_real_time(&attempt.python)),
+        }
+    };
+    match tried() {
+        Ok(true) => record.map_or(ExitCode::SUCCESS, PathRecord::end),
+        Ok(false) => {
+            record.map(PathRecord::end);
+            ExitCode::FAILURE
+        }
+        Err(_) if ended.load(Ordering::SeqCst) => ExitCode::FAILURE,
+        Err(trouble) => failed(trouble),
+    }
+}
+
+/// klippy's Python cannot have the printer's clock.
+fn alone(python: &Path) -> Trouble {
+    Trouble::new("it loads no library, like a static program or one with capabilities")
+        .of(python.display())
+        .remedy("name another Python with --python")
+}
+
+/// Starts this program anew, for a trial in real time.
+fn in_real_time(python: &Path) -> Trouble {
+    log::warn!("the trial runs in real time: {} loads no library: name another Python with --python", python.display());
+    logging::finish();
+    let anew = std::env::current_exe()
+        .map(|program| Command::new(program).args(std::env::args_os().skip(1)).arg("--real-time").exec());
+    let error = anew.unwrap_or_else(|error| error);
+    Trouble::new(format!("the trial cannot run in real time: {error}")).remedy("name another Python with --python")
 }
 
 /// A flag that is set when the program is asked to end.
@@ -335,8 +424,9 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
             realtime::leave();
         }
         if let Place::Folder(folder) = &owner.place {
-            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, &ended);
-            right.store(passed, Ordering::SeqCst);
+            let time = Time::Real(Instant::now(), ended.clone());
+            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, time, &ended);
+            right.store(passed == Some(true), Ordering::SeqCst);
         }
         end();
     });

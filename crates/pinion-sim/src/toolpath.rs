@@ -5,6 +5,7 @@ use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -97,54 +98,79 @@ fn form(path: &Path) -> Result<Form, String> {
     }
 }
 
-/// The thread that records the path.
+/// The path that is recorded, until the program ends.
 pub(crate) struct PathRecord {
     files: Files,
     probe: SimProbe,
-    stop: Sender<()>,
-    recorded: JoinHandle<Recorded>,
+    recorded: Arc<Mutex<Recorded>>,
+    /// A thread that reads it, if nobody else does.
+    reader: Option<(Sender<()>, JoinHandle<()>)>,
 }
 
 struct Recorded {
     recorder: Recorder,
     rings: Vec<RingWatch>,
+    prints: bool,
+}
+
+impl Recorded {
+    fn read(&mut self, now: Clock) {
+        self.recorder.read(now);
+        let settled = Clock::from_ticks(now.ticks().saturating_sub(LATE.0.into()));
+        self.rings.iter_mut().for_each(|ring| ring.read(settled));
+        if !self.prints && self.recorder.points().last().is_some_and(|last| last.layer > 0) {
+            // Homing stops abruptly, and rings more than any print.
+            self.prints = true;
+            self.rings.iter_mut().for_each(RingWatch::forget);
+        }
+    }
+}
+
+fn lock(recorded: &Mutex<Recorded>) -> MutexGuard<'_, Recorded> {
+    recorded.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl PathRecord {
-    /// Records from now on. Start it before the MCU runs: a real-time thread passes its scheduling on.
+    /// Records from now on. Somebody has to call [`PathRecord::reader`]'s function while time passes.
+    pub(crate) fn new(files: Files, probe: SimProbe) -> PathRecord {
+        let recorded = Recorded { recorder: probe.recorder(), rings: probe.rings(), prints: false };
+        PathRecord { files, probe, recorded: Arc::new(Mutex::new(recorded)), reader: None }
+    }
+
+    /// A function that reads the steps until now.
+    pub(crate) fn reader(&self) -> impl FnMut() + Send + 'static {
+        let (recorded, probe) = (self.recorded.clone(), self.probe.clone());
+        move || lock(&recorded).read(probe.now())
+    }
+
+    /// Records from now on, with a thread that reads. Start it before the MCU runs: a real-time thread passes its scheduling
+    /// on.
     pub(crate) fn record(files: Files, probe: SimProbe) -> io::Result<PathRecord> {
+        let record = PathRecord::new(files, probe);
         let (stop, stopped) = mpsc::channel::<()>();
-        let watched = probe.clone();
-        let mut recorded = Recorded { recorder: probe.recorder(), rings: probe.rings() };
+        let mut read = record.reader();
         let thread = thread::Builder::new().name("toolpath".into()).spawn(move || {
-            let mut prints = false;
             while stopped.recv_timeout(READ_PERIOD) == Err(RecvTimeoutError::Timeout) {
-                let now = watched.now();
-                recorded.recorder.read(now);
-                let settled = Clock::from_ticks(now.ticks().saturating_sub(LATE.0.into()));
-                recorded.rings.iter_mut().for_each(|ring| ring.read(settled));
-                if !prints && recorded.recorder.points().last().is_some_and(|last| last.layer > 0) {
-                    // Homing stops abruptly, and rings more than any print.
-                    prints = true;
-                    recorded.rings.iter_mut().for_each(RingWatch::forget);
-                }
+                read();
             }
-            let now = watched.now();
-            // After a moment without a step the path ends.
-            recorded.recorder.read(Clock::from_ticks(now.ticks() + u64::from(LATE.0)));
-            recorded.rings.iter_mut().for_each(|ring| ring.read(now));
-            recorded
         })?;
-        Ok(PathRecord { files, probe, stop, recorded: thread })
+        Ok(PathRecord { reader: Some((stop, thread)), ..record })
     }
 
     /// Writes and compares the path after the MCU has ended. The exit status is 1 if something is wrong with it.
     pub(crate) fn end(self) -> ExitCode {
-        let PathRecord { files, probe, stop, recorded } = self;
-        drop(stop);
-        let Ok(recorded) = recorded.join() else {
-            return failed("the path was not recorded: report this with the log");
-        };
+        let PathRecord { files, probe, recorded, reader } = self;
+        if let Some((stop, thread)) = reader {
+            drop(stop);
+            if thread.join().is_err() {
+                return failed("the path was not recorded: report this with the log");
+            }
+        }
+        let mut recorded = lock(&recorded);
+        let now = probe.now();
+        // After a moment without a step the path ends.
+        recorded.recorder.read(Clock::from_ticks(now.ticks() + u64::from(LATE.0)));
+        recorded.rings.iter_mut().for_each(|ring| ring.read(now));
         let points = recorded.recorder.points();
         let mut page = Page::default();
         let mut troubles = Vec::new();

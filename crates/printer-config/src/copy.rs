@@ -24,6 +24,8 @@ pub struct Change {
     pub section: String,
     /// It is left out as a whole. Otherwise only options are.
     pub left_out: bool,
+    /// The text that comes in the place of a section that is left out.
+    pub instead: Option<String>,
     /// The options that go.
     pub without: Vec<String>,
     /// The options that come.
@@ -111,11 +113,15 @@ fn changed(
     }
     for (name, place) in config.headers.iter().filter(|(_, place)| place.file == *path) {
         let Some(change) = change_of(name) else { continue };
+        let is_first = opened.insert(name.clone());
         if change.left_out {
             comment_out(&mut lines, place.line);
+            if let (true, Some(text), Some(line)) = (is_first, &change.instead, lines.get_mut(place.line - 1)) {
+                *line = format!("{text}\n{line}");
+            }
             continue;
         }
-        if !opened.insert(name.clone()) {
+        if !is_first {
             continue;
         }
         if let Some(line) = lines.get_mut(place.line - 1) {

@@ -219,6 +219,7 @@ fn a_copy_differs_only_where_asked_and_stays_in_its_folder() {
     let change = |section: &str, serial: &str| Change {
         section: section.into(),
         left_out: false,
+        instead: None,
         without: ["serial", "baud", "canbus_uuid"].map(Into::into).into(),
         with: vec![("serial".into(), serial.into())],
     };
@@ -242,7 +243,7 @@ fn a_copy_without_a_section_has_none_of_its_lines() {
     let saved = "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.\n#*#\n#*# [a]\n#*# z =\n#*# \t1, 2\n#*#\n#*# [b]\n#*# z_offset = 1.5\n";
     fs::write(&path, format!("[a]\nx: 1\n  2\n[b]  # b\n[a]\n# y\ny: 3\n{saved}")).unwrap();
     let config = Config::read(&path).unwrap();
-    let gone = Change { section: "a".into(), left_out: true, without: Vec::new(), with: Vec::new() };
+    let gone = Change { section: "a".into(), left_out: true, ..Change::default() };
     let copied = write(&config, &[gone], &folder.path().join("copy")).unwrap();
     let text = fs::read_to_string(&copied).unwrap();
     let saved = "#*# <---------------------- SAVE_CONFIG ---------------------->\n#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.\n#*#\n#*# # [a]\n#*# # z =\n#*# # \t1, 2\n#*#\n#*# [b]\n#*# z_offset = 1.5\n";

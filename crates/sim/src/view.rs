@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::engine::bed::{Bed, Space};
 use super::engine::look::Look;
 use super::engine::motion::Rail;
+use super::engine::pace::PaceWatch;
 use super::engine::recorder::Recorder;
 use super::engine::ring::RingWatch;
 use super::engine::spi::SpiBus;
@@ -146,6 +147,11 @@ impl SimProbe {
     /// Records the path of the nozzle from now on.
     pub fn recorder(&self) -> Recorder {
         Recorder::new(self.bed.clone(), &self.world.extruders, self.settles, self.now())
+    }
+
+    /// Watches how fast the motors are, from now on.
+    pub fn paces(&self) -> PaceWatch {
+        PaceWatch::new(&self.world.axes, self.now())
     }
 
     /// Watches what rings on the axes, from now on.

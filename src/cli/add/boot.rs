@@ -15,7 +15,7 @@ use std::collections::BTreeSet;
 
 use super::side::MARK;
 use crate::cli::computer::board::Bus;
-use crate::cli::computer::uses::boot::{Line, Loaded, is_on, parameter};
+use crate::cli::computer::uses::boot::{ConfigTxt, Env};
 
 fn end_of(text: &str) -> &'static str {
     if text.contains("\r\n") { "\r\n" } else { "\n" }
@@ -26,41 +26,11 @@ fn ended(text: &str) -> String {
     if text.is_empty() || text.ends_with('\n') { text.to_owned() } else { format!("{text}{}", end_of(text)) }
 }
 
-/// A config.txt in which all of `wanted` are on. `lines` and `loaded` are what it says now. `device` is the user of the
-/// lines.
-pub(super) fn config_txt(text: &str, lines: &[Line], loaded: &[Loaded], device: &str, wanted: &[String]) -> String {
+/// A text of config.txt with these lines, which `device` needs.
+pub(super) fn config_txt(text: &str, config: &ConfigTxt, device: &str, wanted: &[String]) -> String {
     let end = end_of(text);
-    let missing = wanted.iter().filter(|line| !has(lines, loaded, line));
+    let missing = wanted.iter().filter(|line| !config.has(line));
     missing.fold(text.to_owned(), |text, line| ended(&text) + &format!("# {MARK} {device}{end}[all]{end}{line}{end}"))
-}
-
-/// Whether a config.txt has the effect of this line.
-fn has(lines: &[Line], loaded: &[Loaded], wanted: &str) -> bool {
-    if let Some(wanted) = wanted.strip_prefix("dtparam=") {
-        let (key, value) = wanted.split_once('=').unwrap_or((wanted, "on"));
-        let base = loaded.iter().filter(|loaded| loaded.name.is_empty() && loaded.is_sure);
-        let last = base.flat_map(|loaded| &loaded.parameters).rfind(|(own, _)| parameter(own) == key);
-        return last.is_some_and(|(_, own)| own == value || is_on(own) && is_on(value));
-    }
-    if let Some(overlay) = wanted.strip_prefix("dtoverlay=") {
-        return loaded.iter().any(|loaded| loaded.is_sure && is_of(loaded, overlay));
-    }
-    let (key, value) = wanted.split_once('=').unwrap_or((wanted, ""));
-    let sure = lines.iter().filter(|line| line.applies == Some(true));
-    let mut settings = sure.filter_map(|line| line.text.split_once('='));
-    settings.rfind(|(own, _)| own.trim() == key).is_some_and(|(_, own)| own.trim() == value)
-}
-
-/// Whether an overlay that is loaded is this one, such as `anyspi:spi0-0,dev="microchip,mcp3208"`, with all its parameters.
-/// Its user may have added others.
-pub(super) fn is_of(loaded: &Loaded, wanted: &str) -> bool {
-    let (name, parameters) = wanted.split_at(wanted.find([',', ':']).unwrap_or(wanted.len()));
-    let set = |part: &str| {
-        let (key, value) = part.split_once('=').unwrap_or((part, "on"));
-        loaded.parameters.iter().any(|(own, is)| own == key && is == value)
-    };
-    let mut parts = parameters.get(1..).unwrap_or_default().split(',').filter(|part| !part.is_empty());
-    loaded.name == name && parts.all(set)
 }
 
 /// One of our lines in a config.txt.
@@ -120,20 +90,12 @@ pub(super) fn handed_over(text: &str, own: &Own, device: &str) -> String {
 ///
 /// One line: the image has none of the known overlays.
 pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>, device: &str) -> Result<String, String> {
-    let prefix = last(text, "overlay_prefix").unwrap_or_default().to_owned();
-    let loaded: Vec<&str> = last(text, "overlays").unwrap_or_default().split_whitespace().collect();
-    let is = |token: &str, name: &str| token == name || token == format!("{prefix}-{name}");
-    let is_loaded = |way: &&Vec<String>| {
-        let (name, parameters) = way.split_first().map_or(("", &[][..]), |(name, rest)| (name.as_str(), rest));
-        let set = |line: &String| line.split_once('=').is_some_and(|(key, value)| last(text, key) == Some(value));
-        loaded.iter().any(|token| is(token, name)) && parameters.iter().all(set)
-    };
-    if bus.overlays.iter().any(|way| is_loaded(&way)) {
+    let env = Env::of(text);
+    let loaded = || env.value("overlays").unwrap_or_default().split_whitespace();
+    if bus.overlays.iter().any(|way| loaded().any(|name| env.is(name, way))) {
         return Ok(text.to_owned());
     }
-    let has = |way: &&Vec<String>| {
-        way.first().is_some_and(|name| files.contains(name) || files.contains(&format!("{prefix}-{name}")))
-    };
+    let has = |way: &&Vec<String>| way.first().is_some_and(|name| files.iter().any(|file| env.short(file) == name));
     let Some((name, parameters)) = bus.overlays.iter().find(has).and_then(|way| way.split_first()) else {
         let kind = bus.node.trim_end_matches(|c: char| !c.is_alphabetic()).trim_end_matches("dev");
         let near: Vec<&str> = files.iter().map(String::as_str).filter(|file| file.contains(kind)).take(8).collect();
@@ -148,15 +110,15 @@ pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>, device: 
     };
     let end = end_of(text);
     let mut changed = text.to_owned();
-    if !loaded.iter().any(|token| is(token, name)) {
-        let words = last(text, "overlays").filter(|words| !words.is_empty());
+    if !loaded().any(|own| env.short(own) == name) {
+        let words = env.value("overlays").filter(|words| !words.is_empty());
         let words = words.map_or_else(|| name.clone(), |words| format!("{words} {name}"));
         changed = set(&changed, "overlays", &words);
         changed = ended(&changed) + &format!("# {MARK} {device}: overlays+={name}{end}");
     }
     for line in parameters {
         let (key, value) = line.split_once('=').unwrap_or((line, ""));
-        let old = last(&changed, key).map(str::to_owned);
+        let old = Env::of(&changed).value(key).map(str::to_owned);
         if old.as_deref() == Some(value) {
             continue;
         }
@@ -180,7 +142,7 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
         let mark = format!("# {MARK} {device}: {own}");
         text = text.split_inclusive('\n').filter(|line| line.trim_end() != mark).collect();
         if let Some(word) = own.strip_prefix("overlays+=") {
-            let value = last(&text, "overlays").unwrap_or_default();
+            let value = Env::of(&text).value("overlays").unwrap_or_default();
             let words: Vec<&str> = value.split_whitespace().collect();
             if !words.contains(&word) {
                 left.push(format!("overlays= has no {word} any more"));
@@ -197,7 +159,7 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
         else {
             continue;
         };
-        if last(&text, key) != Some(value) {
+        if Env::of(&text).value(key) != Some(value) {
             left.push(format!("{key} is not {value} any more, and stays"));
             continue;
         }
@@ -209,12 +171,6 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
 /// The text in which a device's changes are another device's.
 pub(super) fn settings_handed_over(text: &str, device: &str, to: &str) -> String {
     text.replace(&format!("# {MARK} {device}: "), &format!("# {MARK} {to}: "))
-}
-
-/// The value of a key, from its last line. The boot loader imports the lines in order.
-fn last<'a>(text: &'a str, key: &str) -> Option<&'a str> {
-    let values = text.lines().filter_map(|line| line.strip_prefix(key)?.strip_prefix('='));
-    values.map(str::trim_end).next_back()
 }
 
 /// The text with a key's last line changed by `change`.
@@ -240,7 +196,6 @@ mod tests {
     use super::*;
     use crate::cli::computer::board::{Board, Kind};
     use crate::cli::computer::tests::Tree;
-    use crate::cli::computer::uses::boot::{lines, loaded};
     use proptest::prelude::*;
 
     const FILE: &str = "/boot/firmware/config.txt";
@@ -254,8 +209,7 @@ mod tests {
             tree.put(FILE.trim_start_matches('/'), text);
             let computer = tree.computer();
             let board = Board::of(&computer, None).unwrap().unwrap();
-            let lines = lines(&computer, &board, FILE);
-            config_txt(text, &lines, &loaded(&lines, &board), "x", &wanted)
+            config_txt(text, &ConfigTxt::read(&computer, Some(&board)), "x", &wanted)
         };
         let changed = on(text);
         assert_eq!(on(&changed), changed, "a second time");

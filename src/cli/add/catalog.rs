@@ -7,13 +7,7 @@ use serde::Deserialize;
 
 use pinion_printer_config::Section;
 
-use crate::cli::computer::board::{Board, Boot, Kind};
-
-macro_rules! files {
-    ($folder:literal: $($name:literal)*) => {
-        [$(($name, include_str!(concat!($folder, "/", $name, ".toml")))),*]
-    };
-}
+use crate::cli::computer::board::{Board, Boot, Kind, files, names, parse};
 
 /// Each device by its name on the command line, in the order of the list.
 const DEVICES: [(&str, &str); 28] = files!("devices":
@@ -23,15 +17,7 @@ const DEVICES: [(&str, &str); 28] = files!("devices":
     "ws2812" "fan" "relay" "light" "button" "filament" "endstop" "hx711" "tmc2209" "ssd1306");
 
 /// The names of the devices.
-pub(super) const NAMES: [&str; DEVICES.len()] = {
-    let mut names = [""; DEVICES.len()];
-    let mut at = 0;
-    while at < names.len() {
-        names[at] = DEVICES[at].0;
-        at += 1;
-    }
-    names
-};
+pub(super) const NAMES: [&str; DEVICES.len()] = names(&DEVICES);
 
 /// A device that can be added.
 #[derive(Debug, Deserialize)]
@@ -236,9 +222,7 @@ impl Catalog {
     /// The first file with a mistake. The tests find it before a user does.
     pub(super) fn read() -> Result<Catalog, String> {
         let device = |(name, text): (&'static str, &str)| -> Result<Device, String> {
-            let device: Device =
-                toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {name}.toml: {error}"))?;
-            Ok(Device { name, ..device })
+            Ok(Device { name, ..parse(name, text)? })
         };
         Ok(Catalog { devices: DEVICES.into_iter().map(device).collect::<Result<_, _>>()? })
     }

@@ -101,14 +101,12 @@ pub(super) struct AddArgs {
 
 /// Does it. Fails if something is wrong or left undone.
 pub(super) fn run(args: &AddArgs) -> ExitCode {
-    // Changes are made below the folder's descriptor, and a path relative to it would mean another one.
-    let root = match std::fs::canonicalize(&args.root) {
-        Ok(root) if root.is_dir() => root,
-        _ => return failed(format!("{}: there is no such folder", args.root.display())),
+    let (computer, board) = match Computer::named(&args.root, args.board.as_deref()) {
+        Ok(found) => found,
+        Err(why) => return failed(why),
     };
-    let computer = Computer::at(&root);
     let mut report = Report { json: args.json, ..Report::default() };
-    let done = added(args, &computer, &mut report);
+    let done = added(args, &computer, board, &mut report);
     let printed = report.print(done.as_ref().err());
     match (done, printed) {
         (Ok(()), Ok(())) => ExitCode::SUCCESS,
@@ -120,9 +118,8 @@ pub(super) fn run(args: &AddArgs) -> ExitCode {
     }
 }
 
-fn added(args: &AddArgs, computer: &Computer, report: &mut Report) -> Result<(), String> {
+fn added(args: &AddArgs, computer: &Computer, board: Option<Board>, report: &mut Report) -> Result<(), String> {
     let catalog = Catalog::read()?;
-    let board = Board::of(computer, args.board.as_deref())?;
     let model = board::model(computer);
     report.set("model", json!(model));
     report.set("board", json!(board.as_ref().map(|board| &board.name)));

@@ -7,7 +7,6 @@ use std::path::Path;
 use crate::cli::computer::board::{Board, Kind, Spot, function};
 use crate::cli::computer::uses::{Resource, Source, Use, Uses, spi_node};
 
-use super::boot::is_of;
 use super::catalog::{Device, Way, is_line};
 use super::printer::Target;
 
@@ -50,10 +49,10 @@ impl Search<'_> {
     /// Whether a use is the device's: its file, or the overlay that it needs.
     fn is_own(&self, one: &Use, spot: &Spot, way: &Way) -> bool {
         let is_overlay = || {
-            let mut loaded = self.uses.loaded.iter().filter(|loaded| loaded.place == one.place);
+            let mut loaded = self.uses.config_txt.loaded.iter().filter(|loaded| loaded.place == one.place);
             loaded.any(|loaded| {
                 let lines = config_lines(way, spot);
-                lines.iter().filter_map(|line| line.strip_prefix("dtoverlay=")).any(|wanted| is_of(loaded, wanted))
+                lines.iter().filter_map(|line| line.strip_prefix("dtoverlay=")).any(|wanted| loaded.is(wanted))
             })
         };
         let is_section = self.there.as_ref().is_some_and(|section| one.user == format!("[{section}]"));

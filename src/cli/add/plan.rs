@@ -10,7 +10,6 @@ use super::side::{Edit, Side};
 use super::work::Work;
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Boot, Kind};
-use crate::cli::computer::uses::boot::lines;
 
 /// The file that loads the driver of /dev/i2c-*.
 pub(super) const MODULES: &str = "/etc/modules-load.d/pinion-i2c-dev.conf";
@@ -42,7 +41,7 @@ impl Work<'_> {
     pub(super) fn plan_boot(&self) -> Result<(Vec<Edit>, State), String> {
         let Some(bus) = self.board.bus.get(&self.way.bus) else { return Ok((Vec::new(), State::There)) };
         let is_there = self.is_there(self.node());
-        let file = self.computer.first(&self.board.files.iter().map(String::as_str).collect::<Vec<_>>());
+        let file = self.board.file(self.computer);
         let side = Side::new(self.computer, None);
         let own = config_lines(self.way, &self.spot);
         let device = self.device.file(self.name());
@@ -61,8 +60,7 @@ impl Work<'_> {
         let new = match (self.board.boot, file) {
             (Boot::ConfigTxt, Some(file)) if !wanted.is_empty() => {
                 let text = side.read(Path::new(file))?.unwrap_or_default();
-                let lines = lines(self.computer, self.board, file);
-                let new = boot::config_txt(&text, &lines, &self.search.uses.loaded, &device, &wanted);
+                let new = boot::config_txt(&text, &self.search.uses.config_txt, &device, &wanted);
                 Some((file, text, new))
             }
             (Boot::Overlays, Some(file)) if !is_there => {

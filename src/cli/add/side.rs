@@ -9,9 +9,9 @@
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
-use std::fs::{self, File, Permissions};
+use std::fs::{self, File};
 use std::io::{self, Write};
-use std::os::unix::fs::{MetadataExt, PermissionsExt, fchown};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::{Flock, FlockArg};
@@ -19,6 +19,7 @@ use nix::unistd::geteuid;
 
 use crate::cli::computer::Computer;
 use crate::cli::computer::rights::Rights;
+use crate::cli::files::{self, Unwritten};
 use pinion_linux::foreign::{self, word};
 use pinion_linux::own_folder::OwnFolder;
 
@@ -121,7 +122,20 @@ impl<'a> Side<'a> {
             true => text.chars().map(|c| u8::try_from(c).unwrap_or(b'?')).collect(),
             false => text.as_bytes().to_vec(),
         };
-        replace(&folder, &name, &bytes)
+        let there = match fs::symlink_metadata(folder.at(&name)) {
+            Ok(about) if !about.is_file() => return Err(io::Error::other("it is not a regular file")),
+            Ok(about) => Some(about),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        let replaced = files::replace(&folder.at(""), name.as_ref(), there.as_ref(), |out| out.write_all(&bytes));
+        replaced.map_err(|unwritten| match unwritten {
+            Unwritten::Failed(error) => error,
+            Unwritten::Beside(fresh, error) => {
+                let _ = fs::remove_file(folder.at(fresh));
+                error
+            }
+        })
     }
 
     /// Fails if somebody has protected the file: a rename would replace it all the same.
@@ -146,17 +160,26 @@ impl<'a> Side<'a> {
             let probed = || {
                 let _rights = self.rights()?;
                 let (folder, name) = match self.folder(&file, false) {
-                    Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+                    Err(error) if error.kind() == io::ErrorKind::NotFound => return self.refuse_dangling(&file),
                     found => found?,
                 };
-                // Another pinion add may write now.
-                let own = format!("{}.{}", fresh(&name), std::process::id());
-                drop(folder.create(&own)?);
-                fs::remove_file(folder.at(own))
+                let (fresh, _) = files::beside(&folder.at(""), name.as_ref(), None)?;
+                fs::remove_file(folder.at(fresh))
             };
             probed().map_err(|error| failed(&file, &error))?;
         }
         Ok(())
+    }
+
+    /// Fails if the folder of a file is a link that leads nowhere.
+    fn refuse_dangling(&self, file: &Path) -> io::Result<()> {
+        let folder = file.parent().unwrap_or(file);
+        match fs::symlink_metadata(self.computer.unfollowed(folder)?) {
+            Ok(about) if about.is_symlink() => {
+                Err(io::Error::other(format!("{} is a link that leads nowhere: remove it", folder.display())))
+            }
+            _ => Ok(()),
+        }
     }
 
     fn remove(&self, file: &Path) -> io::Result<()> {
@@ -170,8 +193,8 @@ impl<'a> Side<'a> {
         if let Ok(_rights) = self.rights()
             && let Ok((folder, name)) = self.folder(file, false)
         {
-            // As a rule there is none.
-            let _ = fs::remove_file(folder.at(fresh(&name)));
+            files::sweep(&folder.at(""), name.as_ref());
+            files::sweep(&folder.at(""), copy_of(Path::new(&name)).as_os_str());
         }
     }
 
@@ -193,6 +216,7 @@ impl<'a> Side<'a> {
     pub(super) fn make(&self, edits: &[Edit]) -> Result<Vec<String>, String> {
         edits.iter().try_for_each(|edit| self.refuse_read_only(&edit.file))?;
         let _locks = self.locked(edits)?;
+        edits.iter().for_each(|edit| self.sweep(&edit.file));
         let mut told = Vec::new();
         let mut done: Vec<String> = Vec::new();
         for edit in edits {
@@ -283,10 +307,6 @@ pub(super) fn copy_of(file: &Path) -> PathBuf {
     name.into()
 }
 
-fn fresh(name: &str) -> String {
-    format!(".{name}.pinion-add")
-}
-
 fn bytes_in(folder: &OwnFolder, name: &str) -> io::Result<Option<Vec<u8>>> {
     let path = folder.at(name);
     match fs::symlink_metadata(&path) {
@@ -296,31 +316,6 @@ fn bytes_in(folder: &OwnFolder, name: &str) -> io::Result<Option<Vec<u8>>> {
         Ok(about) if about.len() > BYTES_MAX => Err(io::ErrorKind::FileTooLarge.into()),
         Ok(_) => foreign::read(&path, BYTES_MAX).map(Some),
     }
-}
-
-/// Writes a file beside its place, then over it. Its owner and mode stay.
-fn replace(folder: &OwnFolder, name: &str, bytes: &[u8]) -> io::Result<()> {
-    let there = match fs::symlink_metadata(folder.at(name)) {
-        Ok(about) if !about.is_file() => return Err(io::Error::other("it is not a regular file")),
-        Ok(about) => Some(about),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => None,
-        Err(error) => return Err(error),
-    };
-    let fresh = fresh(name);
-    let put = || -> io::Result<()> {
-        let mut file = folder.create(&fresh)?;
-        file.write_all(bytes)?;
-        // A FAT file system has neither owners nor modes to set.
-        let mode = there.as_ref().map_or(0o644, |about| about.mode() & 0o777);
-        let _ = file.set_permissions(Permissions::from_mode(mode));
-        if let Some(about) = &there {
-            let _ = fchown(&file, Some(about.uid()), Some(about.gid()));
-        }
-        file.sync_all()?;
-        fs::rename(folder.at(&fresh), folder.at(name))?;
-        File::open(folder.at("."))?.sync_all()
-    };
-    put().inspect_err(|_| drop(fs::remove_file(folder.at(&fresh))))
 }
 
 fn failed(file: &Path, error: &io::Error) -> String {

@@ -7,7 +7,7 @@ use nix::unistd::geteuid;
 use serde_json::json;
 
 use crate::cli::computer::Computer;
-use crate::cli::computer::board::{Board, Boot, Kind};
+use crate::cli::computer::board::{Board, Boot, Kind, function};
 use crate::cli::computer::printer::configs;
 use crate::cli::computer::uses::{Resource, Source, Use, Uses};
 use pinion_printer_config::Section;
@@ -73,6 +73,11 @@ pub(super) fn undo(
     if computer.is_this() && !boot.is_empty() && !geteuid().is_root() {
         return Err(format!("some of these files are root's: {}", command(args, true)));
     }
+    // Neither side changes before the other one can.
+    root.probe(boot.iter().map(|edit| edit.file.clone()))?;
+    if let Some((side, _)) = &host {
+        side.probe(own.iter().map(|edit| edit.file.clone()))?;
+    }
     if !own.is_empty() || !boot.is_empty() {
         ask(args, computer, moonraker.as_deref(), report, "Take this back?")?;
     }
@@ -118,9 +123,8 @@ impl Needs<'_> {
         let mut edits = Vec::new();
         let own = self.device.file(self.name);
         let Some(board) = &self.uses.board else { return Ok(edits) };
-        let files: Vec<&str> = board.files.iter().map(String::as_str).collect();
         side.sweep(Path::new(MODULES));
-        if let Some(file) = side.computer.first(&files).map(Path::new) {
+        if let Some(file) = board.file(side.computer).map(Path::new) {
             side.sweep(file);
             let old = side.read(file)?.unwrap_or_default();
             let mut new = old.clone();
@@ -192,16 +196,7 @@ impl Needs<'_> {
     /// A section that needs a bus of this kind, with its file.
     fn user_of(&self, board: &Board, kind: Kind) -> Option<(String, PathBuf)> {
         let bus = board.bus.get(&kind)?;
-        let is_user = |one: &&Use| match (&one.what, kind) {
-            (Resource::Select(number, _) | Resource::Controller(number), Kind::Spi | Kind::Leds) => {
-                bus.node.starts_with(&format!("spidev{number}."))
-            }
-            (Resource::I2c(number, _), Kind::I2c) => bus.node == format!("i2c-{number}"),
-            (Resource::Sensor(_), Kind::W1) => true,
-            (Resource::Pwm(name), Kind::Pwm) => name.split('/').next() == bus.node.split('/').next(),
-            (Resource::Port(name), Kind::Uart) => *name == bus.node,
-            _ => false,
-        };
+        let is_user = |one: &&Use| one.what.function() == Some(function(&bus.node));
         let one = self.others().find(is_user)?;
         Some((one.user.clone(), one.place.rsplit_once(':').map_or_else(PathBuf::new, |(file, _)| file.into())))
     }

@@ -3,9 +3,8 @@
 
 use std::io;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, ExitStatus};
 
-use pinion_runtime::klippy::HOST_PATHS;
 use serde_json::json;
 
 use super::catalog::{Catalog, Device, Way, is_line};
@@ -17,8 +16,8 @@ use super::side::Side;
 use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::{Board, Spot};
+use crate::cli::computer::instance::instances;
 use crate::cli::computer::printer::configs;
-use crate::cli::computer::running::Running;
 use crate::cli::files::Output;
 
 /// A device on its way into a printer.
@@ -77,12 +76,7 @@ impl Work<'_> {
             )?;
             let is_live = self.computer.is_this() && !self.args.dry_run;
             if is_live && state == State::NotLoaded {
-                let loaded = Command::new("modprobe").arg("i2c-dev").status();
-                if !loaded.is_ok_and(|status| status.success()) {
-                    return Err("modprobe i2c-dev failed: reboot, then call this again".into());
-                }
-                // The bus is there now, and the chip can be asked for its address.
-                state = State::There;
+                state = loaded(Command::new("modprobe").arg("i2c-dev").status())?;
             } else if is_live {
                 self.report.set("reboot", json!(true));
                 self.report.line("The bus is there after a reboot. Connect the wires while the power is off:");
@@ -244,15 +238,27 @@ impl Work<'_> {
     }
 }
 
+/// The bus is there once its driver is loaded, and the chip can be asked for its address.
+fn loaded(modprobe: io::Result<ExitStatus>) -> Result<State, String> {
+    match modprobe {
+        Ok(status) if status.success() => Ok(State::There),
+        _ => Err("modprobe i2c-dev failed: reboot, then call this again".into()),
+    }
+}
+
 /// Whether a Pinion serves at this link. Klipper's own program may also have made it.
 fn serves(computer: &Computer, link: &Path) -> bool {
-    let name = link.to_str().and_then(|link| link.strip_prefix(HOST_PATHS)).unwrap_or_default();
-    let unit = if name == "mcu" { "pinion-mcu".to_owned() } else { format!("pinion-mcu@{name}") };
-    let is_its = |running: &Running| {
-        let settings = running.settings.as_ref();
-        running.unit.as_ref() == Some(&unit) || settings.is_some_and(|settings| settings.symlink == link)
-            // Pinion in the place of klipper_mcu.
-            || running.unit.as_deref().is_some_and(|unit| crate::cli::computer::units::of_klipper_mcu(unit) && name == "mcu")
-    };
-    link.exists() && computer.running().iter().any(is_its)
+    link.exists() && instances(computer).0.iter().any(|one| one.pid.is_some() && one.link.as_deref() == Some(link))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A chip at its second address was configured with the first one, because nobody asked it.
+    #[test]
+    fn a_bus_whose_driver_was_just_loaded_is_asked() {
+        assert_eq!(loaded(Command::new("true").status()), Ok(State::There));
+        assert!(loaded(Command::new("false").status()).unwrap_err().starts_with("modprobe i2c-dev failed"));
+    }
 }

@@ -8,17 +8,42 @@ use std::collections::BTreeMap;
 
 use pinion_linux::foreign::word;
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 use super::Computer;
 
+/// Files of the program, by their names without the ending.
 macro_rules! files {
-    ($($name:literal)*) => {
-        [$(($name, include_str!(concat!("boards/", $name, ".toml")))),*]
+    ($folder:literal: $($name:literal)*) => {
+        [$(($name, include_str!(concat!($folder, "/", $name, ".toml")))),*]
     };
+}
+pub(in crate::cli) use files;
+
+/// The names of such files.
+pub(in crate::cli) const fn names<const COUNT: usize>(
+    files: &[(&'static str, &'static str); COUNT],
+) -> [&'static str; COUNT] {
+    let mut names = [""; COUNT];
+    let mut at = 0;
+    while at < COUNT {
+        names[at] = files[at].0;
+        at += 1;
+    }
+    names
+}
+
+/// Reads such a file.
+///
+/// # Errors
+///
+/// Its mistake. The tests find it before a user does.
+pub(in crate::cli) fn parse<T: DeserializeOwned>(name: &str, text: &str) -> Result<T, String> {
+    toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {name}.toml: {error}"))
 }
 
 /// Each board by its name on the command line. The first one that fits counts.
-const BOARDS: [(&str, &str); 9] = files!("raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
+const BOARDS: [(&str, &str); 9] = files!("boards": "raspberry-pi-3" "raspberry-pi-4" "raspberry-pi-5" "btt-pad7" "btt-cb1" "btt-cb2"
     "orange-pi-3-lts" "orange-pi-zero-2" "radxa-zero-3");
 
 /// A kind of connection.
@@ -100,6 +125,19 @@ pub(in crate::cli) struct Board {
     pub(in crate::cli) pwm: BTreeMap<String, u32>,
     /// The functions on the header.
     pub(in crate::cli) bus: BTreeMap<Kind, Bus>,
+    /// The clock from which the processor makes that of SPI, if it changes.
+    pub(in crate::cli) clock: Option<Clock>,
+}
+
+/// The VPU's clock of some Raspberry Pis.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::cli) struct Clock {
+    /// The sections of config.txt that apply to the processors with this clock.
+    pub(in crate::cli) sections: Vec<String>,
+    /// `core_freq` and `core_freq_min`, if config.txt does not set them.
+    pub(in crate::cli) usual_mhz: u32,
+    pub(in crate::cli) slowest_mhz: u32,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -179,24 +217,12 @@ pub(in crate::cli) fn function(node: &str) -> String {
 ///
 /// The first file with a mistake. The tests find it before a user does.
 pub(in crate::cli) fn all() -> Result<Vec<Board>, String> {
-    let board = |(id, text): (&'static str, &str)| {
-        let board: Board =
-            toml::from_str(text).map_err(|error| format!("this is a bug in Pinion: {id}.toml: {error}"))?;
-        Ok(Board { id, ..board })
-    };
+    let board = |(id, text): (&'static str, &str)| Ok(Board { id, ..parse(id, text)? });
     BOARDS.into_iter().map(board).collect()
 }
 
 /// The names of the boards on the command line.
-pub(in crate::cli) const NAMES: [&str; 9] = {
-    let mut names = [""; 9];
-    let mut at = 0;
-    while at < names.len() {
-        names[at] = BOARDS[at].0;
-        at += 1;
-    }
-    names
-};
+pub(in crate::cli) const NAMES: [&str; BOARDS.len()] = names(&BOARDS);
 
 impl Board {
     /// The board that this computer is, or the one that has this name.
@@ -226,6 +252,11 @@ impl Board {
         is_marked && self.models.iter().any(|name| name == model)
     }
 
+    /// The file with the boot loader's settings.
+    pub(in crate::cli) fn file(&self, computer: &Computer) -> Option<&str> {
+        self.files.iter().map(String::as_str).find(|file| computer.exists(file))
+    }
+
     /// The line of a pin, as printer.cfg writes it.
     pub(in crate::cli) fn line(&self, pin: usize) -> Option<&str> {
         self.lines.get(&pin.to_string()).map(String::as_str)
@@ -242,14 +273,20 @@ impl Board {
     }
 }
 
-/// The device tree's model.
+/// The device tree's model, or the board that the user has named.
 pub(in crate::cli) fn model(computer: &Computer) -> String {
-    computer.text("/proc/device-tree/model").unwrap_or_default().trim_end_matches('\0').to_owned()
+    let model = computer.text("/proc/device-tree/model").map(|model| model.trim_end_matches('\0').to_owned());
+    model.or_else(|| computer.board.clone()).unwrap_or_default()
 }
 
 /// Whether this is a Raspberry Pi.
 pub(in crate::cli) fn is_pi(computer: &Computer) -> bool {
     model(computer).contains("Raspberry Pi")
+}
+
+/// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
+pub(in crate::cli) fn is_pi5(computer: &Computer) -> bool {
+    ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model(computer).starts_with(name))
 }
 
 /// A Raspberry Pi's config.txt.

@@ -20,8 +20,11 @@ use pinion_linux::foreign;
 use pinion_printer_config::{Disk, Files, NAMES_MAX, is_pattern, matching, names_in};
 use pinion_runtime::klippy::process::Ids;
 
+use board::Board;
+
 pub(super) mod board;
 pub(super) mod device;
+pub(super) mod instance;
 pub(super) mod klippy;
 pub(super) mod manager;
 pub(super) mod printer;
@@ -39,6 +42,8 @@ pub(in crate::cli) struct Computer {
     root: PathBuf,
     /// The user that has called this program.
     caller: Option<u32>,
+    /// The name of its board. A mounted card has no device tree that says so.
+    board: Option<String>,
 }
 
 /// A user, with all groups.
@@ -79,7 +84,28 @@ impl Computer {
         let behind_root = || env::var("SUDO_UID").ok()?.parse().ok();
         let user = getuid();
         let caller = if user.is_root() { behind_root() } else { Some(user.as_raw()) };
-        Computer { root: root.to_owned(), caller }
+        Computer { root: root.to_owned(), caller, board: None }
+    }
+
+    /// The computer whose files are below a folder that the user names, and its board. `/.` is this computer.
+    ///
+    /// # Errors
+    ///
+    /// One line: there is no such folder, or no board has this name.
+    pub(in crate::cli) fn named(root: &Path, board: Option<&str>) -> Result<(Computer, Option<Board>), String> {
+        // Changes are made below the folder's descriptor, and a path relative to it would mean another one.
+        let mut computer = match fs::canonicalize(root) {
+            Ok(root) if root.is_dir() => Computer::at(&root),
+            _ => {
+                return Err(format!(
+                    "{}: there is no such folder: name the one where the system's files are, such as /mnt",
+                    root.display()
+                ));
+            }
+        };
+        let board = Board::of(&computer, board)?;
+        computer.board = board.as_ref().map(|board| board.name.clone());
+        Ok((computer, board))
     }
 
     /// True for the live system (root is `/`). Its kernel knows more than its files.
@@ -191,19 +217,19 @@ impl Computer {
         Err(io::Error::from_raw_os_error(libc::ELOOP))
     }
 
+    /// The lines of /etc/passwd or /etc/group, in fields.
+    fn fields(&self, file: &str) -> Vec<Vec<String>> {
+        let text = self.text(file).unwrap_or_default();
+        text.lines().map(|line| line.split(':').map(str::to_owned).collect()).collect()
+    }
+
     /// A user by name, from the computer's files.
     pub(in crate::cli) fn user(&self, name: &str) -> Option<Who> {
-        let passwd = self.text("/etc/passwd")?;
-        let fields: Vec<&str> =
-            passwd.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|fields| fields[0] == name)?;
+        let fields = self.fields("/etc/passwd").into_iter().find(|fields| fields[0] == name)?;
         let (uid, gid) = (fields.get(2)?.parse().ok()?, fields.get(3)?.parse().ok()?);
-        let groups = self.text("/etc/group").unwrap_or_default();
-        let member = |line: &str| {
-            let mut fields = line.split(':').skip(2);
-            let gid = fields.next()?.parse().ok()?;
-            fields.next()?.split(',').any(|member| member == name).then_some(gid)
-        };
-        let gids = std::iter::once(gid).chain(groups.lines().filter_map(member)).collect();
+        let mut groups = self.fields("/etc/group");
+        groups.retain(|fields| fields.get(3).is_some_and(|members| members.split(',').any(|member| member == name)));
+        let gids = std::iter::once(gid).chain(groups.iter().filter_map(|fields| fields[2].parse().ok())).collect();
         Some(Who { name: name.to_owned(), uid, gids })
     }
 
@@ -223,18 +249,15 @@ impl Computer {
 
     /// The number of a group, given by name or number.
     pub(in crate::cli) fn gid_of(&self, group: &str) -> Option<u32> {
-        let text = self.text("/etc/group").unwrap_or_default();
-        let mut lines = text.lines().map(|line| line.split(':').collect::<Vec<_>>());
-        let line = lines.find(|fields| fields[0] == group);
-        line.map_or_else(|| group.parse().ok(), |fields| fields.get(2)?.parse().ok())
+        let named = self.fields("/etc/group").into_iter().find(|fields| fields[0] == group);
+        named.map_or_else(|| group.parse().ok(), |fields| fields.get(2)?.parse().ok())
     }
 
     /// The name of a number in /etc/passwd or /etc/group. Without a name it is the number itself.
     fn name_of(&self, file: &str, number: u32) -> String {
-        let text = self.text(file).unwrap_or_default();
-        let has = |line: &&str| line.split(':').nth(2) == Some(&number.to_string());
-        let name = text.lines().find(has).and_then(|line| line.split(':').next());
-        name.map_or_else(|| number.to_string(), str::to_owned)
+        let number = number.to_string();
+        let named = self.fields(file).into_iter().find(|fields| fields.get(2) == Some(&number));
+        named.map_or(number, |fields| fields[0].clone())
     }
 
     /// A file's owner, group and mode as text: `root:gpio 0660`.
@@ -320,7 +343,7 @@ pub(super) mod tests {
         }
 
         pub(in crate::cli) fn computer(&self) -> Computer {
-            Computer { root: self.0.path().to_owned(), caller: None }
+            Computer { root: self.0.path().to_owned(), caller: None, board: None }
         }
 
         /// The same for a program that this user has called.
@@ -380,6 +403,14 @@ pub(super) mod tests {
             self.put(&format!("proc/{pid}/status"), &status);
             self.put(&format!("proc/{pid}/exe"), "");
         }
+    }
+
+    #[test]
+    fn a_longer_path_of_the_root_folder_is_this_computer() {
+        for root in ["/", "/.", "/proc/.."] {
+            assert!(Computer::named(Path::new(root), None).unwrap().0.is_this(), "{root}");
+        }
+        assert!(Computer::named(Path::new("/nonexistent"), None).is_err());
     }
 
     #[test]

@@ -11,11 +11,9 @@ use pinion_printer_config::pins::{Aliases, Pin};
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::HOST_PATHS;
 
+use super::instance::instances;
 use super::rights::Rights;
-use super::running::Running;
-use super::{Computer, klippy, units};
-use crate::cli::config;
-use crate::cli::settings::BoardName;
+use super::{Computer, klippy};
 
 /// Where klippy's configuration is if no klippy runs or is set up.
 const USUAL: [&str; 5] = [
@@ -129,13 +127,16 @@ impl Printer {
     /// user has `named` its MCU.
     pub(in crate::cli) fn own_mcus(&self, computer: &Computer, named: Option<&str>) -> BTreeMap<String, PathBuf> {
         // A file may name many, and the processes are looked at once.
-        let running = OnceCell::new();
-        let running = || running.get_or_init(|| computer.running()).as_slice();
+        let found = OnceCell::new();
+        let is_served = |link: &str| {
+            let instances = || found.get_or_init(|| instances(computer).0);
+            link == LINK || link.starts_with(HOST_PATHS) && instances().iter().any(|one| one.serves(Path::new(link)))
+        };
         let mcus = self.config.of_kind("mcu").filter_map(|section| {
             let name = section.name.strip_prefix("mcu ").map_or("mcu", str::trim);
-            let serial = section.text("serial").filter(|serial| {
-                named == Some(name) && serial.starts_with(HOST_PATHS) || is_served(computer, &running, serial)
-            })?;
+            let serial = section
+                .text("serial")
+                .filter(|serial| named == Some(name) && serial.starts_with(HOST_PATHS) || is_served(serial))?;
             Some((name.to_owned(), PathBuf::from(serial)))
         });
         mcus.collect()
@@ -170,27 +171,6 @@ impl Printer {
         let pins = self.pins().filter(|named| line_of(&named.pin.name).is_some());
         pins.filter_map(|named| Some((self.serial(&named.pin.chip)?.into(), named.pin.name))).collect()
     }
-}
-
-/// Whether a Pinion on this computer's own pins serves this link, or will.
-fn is_served<'a>(computer: &Computer, running: &impl Fn() -> &'a [Running], serial: &str) -> bool {
-    let Some(name) = serial.strip_prefix(HOST_PATHS) else { return false };
-    let unit = format!("pinion-mcu@{name}");
-    let serves = |running: &Running| {
-        let by = running.settings.as_ref();
-        let has_link = running.unit.as_ref() == Some(&unit) || by.is_some_and(|by| by.symlink == Path::new(serial));
-        has_link && by.is_none_or(|by| by.board == BoardName::Linux)
-    };
-    let is_set_up = || {
-        let file = format!("/etc/pinion/{name}.toml");
-        let settings = || {
-            let path = computer.resolve(Path::new(&file)).ok()?;
-            Some(config::load_foreign(&path, &file).ok()?.settings())
-        };
-        !units::enabled(computer, |own| own == unit).is_empty()
-            && settings().is_none_or(|settings| settings.board == BoardName::Linux)
-    };
-    serial == LINK || running().iter().any(serves) || is_set_up()
 }
 
 /// The chip and the line that a numeric name means: `gpio17` and `gpiochip0/gpio17`.

@@ -6,16 +6,17 @@ use std::fs;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
-use crate::cli::computer::board::{append, is_pi, model, pi_config};
+use crate::cli::computer::board::{append, is_pi, pi_config};
 use crate::cli::computer::device::Port;
+use crate::cli::computer::uses::boot::ConfigTxt;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use pinion_linux::foreign::word;
 use pinion_linux::gpio::{FastGpio, LINK_REMEDY, never_sleeps};
 
-use super::instance::Instance;
 use super::{INSTALL, REINSTALL};
+use crate::cli::computer::instance::Instance;
 
 /// A kind of devices.
 pub(super) struct Class {
@@ -24,72 +25,41 @@ pub(super) struct Class {
     pub(super) access: Access,
     /// udev's subsystem.
     subsystem: &'static str,
-    /// The line of a Raspberry Pi's config.txt that enables it, and the beginnings of other lines that do.
-    enabled_by: Option<(&'static str, &'static [&'static str])>,
+    /// The line of a Raspberry Pi's config.txt that enables it, and how the overlays and parameters that do so begin.
+    enabled_by: Option<(&'static str, &'static str)>,
     /// The files that Pinion has to open.
     pub(super) nodes: &'static str,
 }
 
-const CLASSES: [Class; 6] = [
-    Class {
-        check: "gpio",
-        name: "GPIO",
-        access: Access::READ_WRITE,
-        subsystem: "gpio",
-        enabled_by: None,
-        nodes: "/dev/gpiochip*",
-    },
-    Class {
-        check: "adc",
-        name: "ADC",
-        access: Access::READ,
-        subsystem: "iio",
-        enabled_by: None,
-        nodes: "/sys/bus/iio/devices/iio:device*/in_voltage*_raw",
-    },
-    Class {
-        check: "pwm",
-        name: "PWM",
-        access: Access::WRITE,
-        subsystem: "pwm",
-        enabled_by: Some(("dtoverlay=pwm-2chan", &["dtoverlay=pwm"])),
-        nodes: "/sys/class/pwm/pwmchip*/export",
-    },
-    Class {
-        check: "spi",
-        name: "SPI",
-        access: Access::READ_WRITE,
-        subsystem: "spidev",
-        enabled_by: Some(("dtparam=spi=on", &["dtparam=spi", "dtoverlay=spi"])),
-        nodes: "/dev/spidev*",
-    },
-    Class {
-        check: "i2c",
-        name: "I2C",
-        access: Access::READ_WRITE,
-        subsystem: "i2c-dev",
-        enabled_by: Some(("dtparam=i2c_arm=on", &["dtparam=i2c", "dtoverlay=i2c"])),
-        nodes: "/dev/i2c-*",
-    },
-    Class {
-        check: "w1",
-        name: "1-Wire",
-        access: Access::READ,
-        subsystem: "w1",
-        enabled_by: Some(("dtoverlay=w1-gpio", &["dtoverlay=w1-gpio"])),
-        nodes: "/sys/bus/w1/devices/28-*/w1_slave",
-    },
-];
+impl Class {
+    const fn new(
+        (check, name): (&'static str, &'static str),
+        access: Access,
+        subsystem: &'static str,
+        nodes: &'static str,
+        enabled_by: Option<(&'static str, &'static str)>,
+    ) -> Class {
+        Class { check, name, access, subsystem, enabled_by, nodes }
+    }
+}
 
+const ADC: &str = "/sys/bus/iio/devices/iio:device*/in_voltage*_raw";
+const PWM: &str = "/sys/class/pwm/pwmchip*/export";
+const W1: &str = "/sys/bus/w1/devices/28-*/w1_slave";
+
+const CLASSES: [Class; 6] = [
+    Class::new(("gpio", "GPIO"), Access::READ_WRITE, "gpio", "/dev/gpiochip*", None),
+    Class::new(("adc", "ADC"), Access::READ, "iio", ADC, None),
+    Class::new(("pwm", "PWM"), Access::WRITE, "pwm", PWM, Some(("dtoverlay=pwm-2chan", "pwm"))),
+    Class::new(("spi", "SPI"), Access::READ_WRITE, "spidev", "/dev/spidev*", Some(("dtparam=spi=on", "spi"))),
+    Class::new(("i2c", "I2C"), Access::READ_WRITE, "i2c-dev", "/dev/i2c-*", Some(("dtparam=i2c_arm=on", "i2c"))),
+    Class::new(("w1", "1-Wire"), Access::READ, "w1", W1, Some(("dtoverlay=w1-gpio", "w1-gpio"))),
+];
 /// The registers of GPIO chips.
-pub(super) const FAST: Class = Class {
-    check: "fast_gpio",
-    name: "fast lines",
-    access: Access::READ_WRITE,
-    subsystem: "*gpiomem*",
-    enabled_by: None,
-    nodes: "/dev/gpiomem*",
-};
+pub(super) const FAST: Class =
+    Class::new(("fast_gpio", "fast lines"), Access::READ_WRITE, "*gpiomem*", "/dev/gpiomem*", None);
+const SERIAL: Class = Class::new(("serial", "serial port"), Access::READ_WRITE, "tty", "/dev", None);
+const WATCHDOG: Class = Class::new(("watchdog", "watchdog"), Access::WRITE, "misc", "/dev/watchdog", None);
 
 /// The kernel's policy for the sleep of PCIe links.
 const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
@@ -124,14 +94,6 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     };
     let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
-    const SERIAL: Class = Class {
-        check: "serial",
-        name: "serial port",
-        access: Access::READ_WRITE,
-        subsystem: "tty",
-        enabled_by: None,
-        nodes: "/dev",
-    };
     let there = ports.iter().filter_map(|name| match computer.port(name) {
         Port::There(port) => Some(computer.path(format!("/dev/{port}"))),
         Port::Missing | Port::Other => None,
@@ -139,14 +101,6 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     let ports: Vec<PathBuf> = there.collect();
     findings.extend(self::permission(computer, user, &anew, &SERIAL, &ports));
     if instances.iter().any(|instance| instance.settings.watchdog) {
-        const WATCHDOG: Class = Class {
-            check: "watchdog",
-            name: "watchdog",
-            access: Access::WRITE,
-            subsystem: "misc",
-            enabled_by: None,
-            nodes: "/dev/watchdog",
-        };
         findings.extend(permission(&WATCHDOG));
     }
     let wants = |wish| instances.iter().any(|instance| instance.settings.fast_gpio == wish);
@@ -211,11 +165,11 @@ fn rules_are_there(computer: &Computer) -> bool {
 }
 
 /// Which pins and buses there are, and how to enable the missing ones.
-pub(super) fn presence(computer: &Computer) -> Vec<Finding> {
-    CLASSES.iter().map(|class| present(computer, class)).collect()
+pub(super) fn presence(computer: &Computer, config_txt: &ConfigTxt) -> Vec<Finding> {
+    CLASSES.iter().map(|class| present(computer, config_txt, class)).collect()
 }
 
-fn present(computer: &Computer, class: &Class) -> Finding {
+fn present(computer: &Computer, config_txt: &ConfigTxt, class: &Class) -> Finding {
     let Class { check, name, .. } = *class;
     let nodes = computer.matching(class.nodes);
     if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(computer, class, node)?))) {
@@ -238,19 +192,13 @@ fn present(computer: &Computer, class: &Class) -> Finding {
         return Finding::warning(check, "I2C: there are buses, and no /dev/i2c-*: i2c-dev is not loaded", remedy);
     }
     let off = format!("{name}: none");
-    let Some((line, beginnings)) = class.enabled_by else {
+    let Some((line, beginning)) = class.enabled_by else {
         return Finding::ok(check, off).or("if there is one, load its driver (a device tree overlay, as a rule)");
     };
     let Some(config) = is_pi(computer).then(|| pi_config(computer)).flatten() else {
         return Finding::ok(check, off).or("if it is wanted, enable it in the device tree, and reboot");
     };
-    let text = computer.text(config).unwrap_or_default();
-    let is_on = |line: &str| {
-        let line = line.trim();
-        let off = ["=off", "=0", "=false"].iter().any(|end| line.ends_with(end));
-        !off && beginnings.iter().any(|beginning| line.starts_with(beginning))
-    };
-    match text.lines().any(is_on) {
+    match config_txt.enables(beginning) {
         true if check == "w1" => Finding::warning(
             check,
             "1-Wire: on, and no DS18B20 answers",
@@ -270,12 +218,6 @@ fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<St
     (subsystem != class.subsystem).then_some(subsystem)
 }
 
-/// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
-pub(super) fn is_pi5(computer: &Computer) -> bool {
-    let model = model(computer);
-    ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model.starts_with(name))
-}
-
 /// Whether the GPIO chip is a Raspberry Pi 5's: its registers have a node with a number.
 pub(super) fn is_rp1(computer: &Computer) -> bool {
     computer.path("/dev/gpiomem0").exists()
@@ -283,10 +225,10 @@ pub(super) fn is_rp1(computer: &Computer) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
     use crate::cli::boards;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use std::os::unix::fs::MetadataExt;
@@ -294,6 +236,10 @@ mod tests {
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
         let instances = instances(&tree.computer()).0;
         permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user, &["ttyAMA1".to_owned()].into())
+    }
+
+    fn present(tree: &Tree) -> Vec<Finding> {
+        presence(&tree.computer(), &ConfigTxt::read(&tree.computer(), None))
     }
 
     /// A user other than root and other than the one that runs the tests.
@@ -407,14 +353,13 @@ mod tests {
     fn a_node_of_another_kind_is_no_chip() {
         let tree = Tree::new();
         tree.link("dev/gpiochip0", "/dev/null");
-        says(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        says(&present(&tree), "gpio", Fine, "GPIO: /dev/gpiochip0");
         tree.link("sys/dev/char/1:3/subsystem", "../../../../class/mem");
-        let remedy =
-            says(&presence(&tree.computer()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
+        let remedy = says(&present(&tree), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
         assert!(remedy.starts_with("sudo rm /dev/gpiochip0 && sudo udevadm trigger"), "{remedy}");
         fs::remove_file(tree.computer().path("/sys/dev/char/1:3/subsystem")).unwrap();
         tree.link("sys/dev/char/1:3/subsystem", "../../../../bus/gpio");
-        says(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        says(&present(&tree), "gpio", Fine, "GPIO: /dev/gpiochip0");
     }
 
     #[test]
@@ -431,21 +376,21 @@ mod tests {
     #[test]
     fn what_is_there_and_how_to_enable_the_rest() {
         let tree = Tree::new();
-        let findings = presence(&tree.computer());
+        let findings = present(&tree);
         says(&findings, "gpio", Warning, "no GPIO chip");
         assert!(says(&findings, "spi", Fine, "SPI: none").contains("device tree"));
         tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
         tree.put("boot/firmware/config.txt", "#dtparam=spi=on\ndtparam=i2c_arm=on\ndtoverlay=w1-gpio\n");
-        let findings = presence(&tree.computer());
+        let findings = present(&tree);
         let remedy = says(&findings, "spi", Fine, "SPI: off");
         assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
         assert_eq!(says(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
         says(&findings, "w1", Warning, "no DS18B20 answers");
         assert!(says(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
         tree.put("sys/bus/i2c/devices/i2c-1/name", "");
-        assert!(says(&presence(&tree.computer()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
+        assert!(says(&present(&tree), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
-        let findings = presence(&tree.computer());
+        let findings = present(&tree);
         assert!(
             findings.iter().all(|finding| finding.status == Fine && finding.trouble.remedy.is_none()),
             "{findings:?}"
@@ -454,9 +399,32 @@ mod tests {
     }
 
     #[test]
+    fn the_whole_config_txt_says_what_is_on() {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
+        for (text, is_on) in [
+            ("dtparam=spi=on\n", true),
+            ("dtparam=i2c_arm=on,spi=on\n", true),
+            ("[pi4]\ndtparam=spi=on\n", true),
+            ("include more.txt\n", true),
+            ("dtoverlay=spi1-1cs\n", true),
+            ("[pi5]\ndtparam=spi=on\n", false),
+            ("dtparam=spi=on\ndtparam=spi=off\n", false),
+        ] {
+            tree.put("boot/firmware/config.txt", text);
+            tree.put("boot/firmware/more.txt", "dtparam=spi=on\n");
+            let findings = present(&tree);
+            match is_on {
+                true => drop(says(&findings, "spi", Warning, "on in /boot/firmware/config.txt, and not there")),
+                false => drop(says(&findings, "spi", Fine, "SPI: off")),
+            }
+        }
+    }
+
+    #[test]
     fn only_a_raspberry_pi_has_a_config_txt() {
         for board in [boards::cb1(), boards::rk3566()] {
-            let findings = presence(&board.tree().computer());
+            let findings = present(&board.tree());
             says(&findings, "gpio", Fine, "GPIO: /dev/gpiochip0 and ");
             for finding in findings {
                 assert_eq!(finding.status, Fine, "{finding:?}");
@@ -465,7 +433,7 @@ mod tests {
             }
         }
         for board in boards::all() {
-            says(&presence(&board.tree().computer()), "gpio", Fine, "GPIO: /dev/gpiochip");
+            says(&present(&board.tree()), "gpio", Fine, "GPIO: /dev/gpiochip");
         }
     }
 }

@@ -14,8 +14,8 @@ use pinion_firmware::trouble::Trouble;
 use pinion_runtime::klippy::{self as host, Checkout};
 
 use super::UPGRADE;
-use super::instance::Instance;
 use super::klipper;
+use crate::cli::computer::instance::Instance;
 
 /// The checks that are left out because a klippy's configuration cannot be used.
 pub(super) fn unchecked(klippys: &[Klippy]) -> Vec<Finding> {
@@ -123,9 +123,9 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::klippy::klippys;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};

@@ -6,7 +6,7 @@ use crate::cli::finding::Finding;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
 use pinion_runtime::realtime::is_preempt_rt;
 
-use super::instance::Instance;
+use crate::cli::computer::instance::Instance;
 
 /// The oldest supported kernel: it opens a terminal whatever the terminal's permissions are (TIOCGPTPEER).
 const OLDEST: (u32, u32) = (4, 13);
@@ -47,20 +47,21 @@ fn version(computer: &Computer) -> Finding {
 fn preempt_rt(computer: &Computer) -> Finding {
     const CHECK: &str = "preempt_rt";
     let release = computer.text("/proc/sys/kernel/osrelease").unwrap_or_else(|| "of unknown version".into());
-    let package = match () {
-        () if release.contains("rpi") => "linux-image-rpi-v8-rt",
-        () if cfg!(target_arch = "x86_64") => "linux-image-rt-amd64",
-        () if cfg!(target_arch = "aarch64") => "linux-image-rt-arm64",
-        () => "linux-image-rt-armmp",
+    let install = match () {
+        () if release.contains("rpi-v6") || release.contains("rpi-v7") => {
+            "install a 64-bit Raspberry Pi OS, which has such a kernel (linux-image-rpi-v8-rt)"
+        }
+        () if release.contains("rpi") => "sudo apt install linux-image-rpi-v8-rt, and reboot",
+        () if cfg!(target_arch = "x86_64") => "sudo apt install linux-image-rt-amd64, and reboot",
+        () if cfg!(target_arch = "aarch64") => "sudo apt install linux-image-rt-arm64, and reboot",
+        () => "sudo apt install linux-image-rt-armmp, and reboot",
     };
     match is_preempt_rt(&computer.path("/")) {
         Some(true) => Finding::ok(CHECK, format!("kernel {release} is PREEMPT_RT")),
         Some(false) => Finding::warning(
             CHECK,
             format!("kernel {release} is not PREEMPT_RT: steps may be late while other programs work"),
-            format!(
-                "sudo apt install {package}, and reboot; not needed where pinion latency says \"fit for steppers\""
-            ),
+            format!("{install}; not needed where pinion latency says \"fit for steppers\""),
         ),
         None => Finding::ok(CHECK, "whether the kernel is PREEMPT_RT is unknown: there is no /proc/version"),
     }
@@ -181,9 +182,9 @@ fn governor(computer: &Computer) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
 
@@ -225,6 +226,10 @@ mod tests {
         let findings = found(&tree, None);
         let rt = says(&findings, "preempt_rt", Warning, "6.1.0-rpi4-rpi-v8 is not PREEMPT_RT");
         assert!(rt.starts_with("sudo apt install linux-image-rpi-v8-rt"), "{rt}");
+        // There is no such package for 32 bits.
+        tree.put("proc/sys/kernel/osrelease", "6.12.25+rpt-rpi-v7\n");
+        let rt = says(&found(&tree, None), "preempt_rt", Warning, "6.12.25+rpt-rpi-v7 is not PREEMPT_RT");
+        assert!(rt.starts_with("install a 64-bit Raspberry Pi OS"), "{rt}");
         says(&findings, "rt_throttling", Error, "no real time");
         assert_eq!(says(&findings, "isolated_cpus", Warning, "nobody uses"), "cpu = 3 in /etc/pinion/pinion.toml");
         says(&findings, "governor", Warning, "is ondemand:");

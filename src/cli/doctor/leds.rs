@@ -6,85 +6,36 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::cli::computer::Computer;
-use crate::cli::computer::board::{append, is_pi, model, pi_config};
+use crate::cli::computer::board::{self, Clock, Kind, append, pi_config};
+use crate::cli::computer::uses::boot::ConfigTxt;
 use crate::cli::finding::Finding;
-use crate::cli::settings::BoardName;
 use pinion_linux::gpio::FastGpio;
 
 use super::devices::{FAST, is_rp1};
-use super::instance::Instance;
+use crate::cli::computer::instance::Instance;
 
 const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
 
-/// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
-struct Vpu {
-    models: &'static [&'static str],
-    /// How the sections of config.txt begin that apply only to these models.
-    sections: &'static [&'static str],
-    core_freq: u32,
-    /// The value of `core_freq_min` if config.txt does not set it.
-    slowest: u32,
-    lines: &'static str,
-}
-
-const VPUS: [Vpu; 3] = [
-    Vpu {
-        models: &["Pi 4", "Module 4"],
-        sections: &["pi4", "cm4"],
-        core_freq: 500,
-        slowest: 200,
-        lines: "core_freq=500\\ncore_freq_min=500",
-    },
-    Vpu {
-        models: &["Pi 3", "Module 3"],
-        sections: &["pi3", "cm3"],
-        core_freq: 400,
-        slowest: 250,
-        lines: "core_freq=250",
-    },
-    Vpu { models: &["Pi Zero"], sections: &["pi0"], core_freq: 400, slowest: 250, lines: "core_freq=250" },
-];
-
-impl Vpu {
-    /// Whether config.txt keeps the clock from changing. Sections whose condition is not the model count.
-    fn is_held(&self, config: &str) -> bool {
-        let (mut core_freq, mut slowest, mut is_forced, mut applies) = (self.core_freq, self.slowest, false, true);
-        for line in config.lines().map(str::trim) {
-            if let Some(section) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
-                let is_model = ["pi", "cm"].iter().any(|model| section.starts_with(model));
-                let is_own = self.sections.iter().any(|own| section.starts_with(own));
-                applies = section != "none" && (!is_model || is_own);
-            }
-            let Some((key, value)) = line.split_once('=').filter(|_| applies) else { continue };
-            let Ok(value) = value.trim().parse() else { continue };
-            match key.trim() {
-                "core_freq" => core_freq = value,
-                "core_freq_min" => slowest = value,
-                "force_turbo" => is_forced = value == 1,
-                _ => {}
-            }
-        }
-        is_forced || slowest >= core_freq
-    }
-}
-
 /// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
-pub(super) fn leds(computer: &Computer, pins: &BTreeSet<String>) -> Vec<Finding> {
+pub(super) fn leds(computer: &Computer, config_txt: &ConfigTxt, pins: &BTreeSet<String>) -> Vec<Finding> {
     const CHECK: &str = "leds";
-    let model = model(computer);
-    let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
-    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(computer)) else { return Vec::new() };
-    let Some(first) = pins.first() else { return Vec::new() };
-    let text = pi_config(computer).and_then(|config| Some((config, computer.text(config)?)));
-    let Some((config, text)) = text else { return Vec::new() };
-    let lines = vpu.lines;
-    let clock = match vpu.is_held(&text) {
+    let (Some(first), Some(config)) = (pins.first(), pi_config(computer)) else { return Vec::new() };
+    let has = |clock: &Clock| clock.sections.iter().any(|own| config_txt.sections.contains(&own.as_str()));
+    let boards = board::all().unwrap_or_default();
+    let Some(board) = boards.iter().find(|board| board.clock.as_ref().is_some_and(has)) else { return Vec::new() };
+    let clock = match is_held(config_txt, board.clock.as_ref()) {
         true => Finding::ok(CHECK, format!("LEDs: {config} holds the clock of SPI")),
-        false => Finding::warning(
-            CHECK,
-            format!("LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"),
-            format!("{}, and reboot", append(computer, lines)),
-        ),
+        false => {
+            let lines = board.bus.get(&Kind::Leds).map(|bus| &bus.enable[..]).unwrap_or_default();
+            let lines: Vec<&str> = lines.iter().map(String::as_str).filter(|line| !line.starts_with("dt")).collect();
+            Finding::warning(
+                CHECK,
+                format!(
+                    "LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"
+                ),
+                format!("{}, and reboot", append(computer, &lines.join("\\n"))),
+            )
+        }
     };
     let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
     let bus = without_dma.map(|pin| {
@@ -94,16 +45,22 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<String>) -> Vec<Finding>
     [Some(clock), bus].into_iter().flatten().collect()
 }
 
+/// Whether config.txt keeps this clock from changing.
+fn is_held(config_txt: &ConfigTxt, clock: Option<&Clock>) -> bool {
+    let number = |key: &str| config_txt.value(key)?.parse::<u32>().ok();
+    let is_steady = |clock: &Clock| {
+        number("core_freq_min").unwrap_or(clock.slowest_mhz) >= number("core_freq").unwrap_or(clock.usual_mhz)
+    };
+    number("force_turbo") == Some(1) || clock.is_none_or(is_steady)
+}
+
 /// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
 pub(super) fn line_leds(
     computer: &Computer,
     instances: &[Instance],
     pins: &BTreeSet<(PathBuf, String)>,
 ) -> Vec<Finding> {
-    let own = |link: &Path| {
-        let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-        own.find(|instance| instance.link.as_deref() == Some(link))
-    };
+    let own = |link: &Path| instances.iter().find(|instance| instance.serves(link));
     let pins = pins.iter().filter_map(|(link, pin)| Some((own(link)?, pin)));
     pins.map(|(instance, pin)| line_led(computer, instance, pin)).collect()
 }
@@ -140,9 +97,9 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
 
@@ -152,7 +109,7 @@ mod tests {
             let tree = Tree::new();
             tree.put("proc/device-tree/model", model);
             tree.put("boot/firmware/config.txt", config);
-            leds(&tree.computer(), &[pin.to_owned()].into())
+            leds(&tree.computer(), &ConfigTxt::read(&tree.computer(), None), &[pin.to_owned()].into())
         };
         for (model, held, loose, remedy) in [
             (
@@ -195,7 +152,8 @@ mod tests {
         let tree = Tree::new();
         tree.put("proc/device-tree/model", "Raspberry Pi 4");
         tree.put("boot/config.txt", "");
-        assert!(leds(&tree.computer(), &BTreeSet::new()).is_empty(), "there are no LEDs");
+        let config_txt = ConfigTxt::read(&tree.computer(), None);
+        assert!(leds(&tree.computer(), &config_txt, &BTreeSet::new()).is_empty(), "there are no LEDs");
     }
 
     #[test]

@@ -1,26 +1,21 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! GPIO lines: which ones the pins of a printer.cfg mean, and which processes hold them.
+//! GPIO lines: which ones the pins of a printer.cfg mean.
 
 use std::collections::BTreeSet;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::cli::computer::Computer;
 use crate::cli::computer::board::is_pi;
 use crate::cli::computer::printer::line_of;
 use crate::cli::finding::Finding;
-use crate::cli::settings::BoardName;
 use pinion_linux::Inventory;
-use pinion_linux::gpio::Chip;
 use pinion_linux::pins::{Names, line_number};
 
-use super::instance::Instance;
+use crate::cli::computer::instance::Instance;
 
 /// The pins whose MCU is one of these instances, and has this computer's lines.
 pub(super) fn of_instances<'a>(instances: &[Instance], pins: &'a BTreeSet<(PathBuf, String)>) -> BTreeSet<&'a str> {
-    let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
-    let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
-    pins.iter().filter(|(link, _)| links.contains(&link.as_path())).map(|(_, pin)| pin.as_str()).collect()
+    pins.iter().filter(|(link, _)| instances.iter().any(|one| one.serves(link))).map(|(_, pin)| pin.as_str()).collect()
 }
 
 /// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
@@ -80,55 +75,15 @@ pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet
     findings
 }
 
-/// The holders of GPIO lines.
-pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
-    const CHECK: &str = "gpio_lines";
-    /// `pinion pins` lists more.
-    const SHOWN: usize = 8;
-    let chip = |chip: &Chip| {
-        let held = (0u32..).zip(&chip.lines).filter(|(_, line)| line.held);
-        let mut held: Vec<String> = held
-            .map(|(offset, line)| format!("{offset} by \"{}\"", line.consumer.as_deref().unwrap_or("the kernel")))
-            .collect();
-        let count = held.len();
-        held.truncate(SHOWN);
-        let more = if count > SHOWN { ", ... (pinion pins lists all)" } else { "" };
-        let colon = if count > 0 { ": " } else { "" };
-        let (number, label, lines) = (chip.number, &chip.label, chip.lines.len());
-        let list = held.join(", ");
-        Finding::ok(CHECK, format!("gpiochip{number} {label}: {count} of {lines} lines are held{colon}{list}{more}"))
-    };
-    let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
-    let programs: Vec<String> = computer
-        .all_processes()
-        .iter()
-        .filter(|process| {
-            let folder = computer.path(format!("/proc/{}/fd", process.pid));
-            let files = fs::read_dir(folder).into_iter().flatten().flatten();
-            let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
-            // The target is of one line, of several lines, or of a line with edges (drivers/gpio/gpiolib-cdev.c).
-            targets.any(|target| target.to_string_lossy().starts_with("anon_inode:gpio"))
-        })
-        .map(|process| {
-            let program = process.arguments.first().and_then(|program| program.file_name());
-            format!("{} (process {})", program.unwrap_or_default().to_string_lossy(), process.pid)
-        })
-        .collect();
-    if !programs.is_empty() {
-        findings.push(Finding::ok(CHECK, format!("programs that hold lines: {}", programs.join(", "))));
-    }
-    findings
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
     use crate::cli::boards::{self, TestBoard};
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Ok as Fine, Warning};
-    use pinion_linux::gpio::LineInfo;
+    use std::path::Path;
 
     /// The findings about the header of a board, with these pins in printer.cfg.
     fn about_header(board: &TestBoard, pins: &[&str]) -> Vec<Finding> {
@@ -177,36 +132,5 @@ mod tests {
         assert_eq!(pins(), ["gpio17"].into());
         tree.put("etc/pinion/pinion.toml", "board = \"sim\"\n");
         assert!(pins().is_empty());
-    }
-
-    #[test]
-    fn who_holds_which_line() {
-        let tree = Tree::new();
-        let line = |consumer: Option<&str>, held| LineInfo {
-            held,
-            consumer: consumer.map(str::to_owned),
-            ..LineInfo::default()
-        };
-        let chip = Chip {
-            number: 0,
-            label: "pinctrl".into(),
-            sleeps: false,
-            lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
-        };
-        let findings = holders(&tree.computer(), std::slice::from_ref(&chip));
-        says(
-            &findings,
-            "gpio_lines",
-            Fine,
-            "gpiochip0 pinctrl: 2 of 3 lines are held: 0 by \"spi0 CS0\", 2 by \"the kernel\"",
-        );
-        assert_eq!(findings.len(), 1);
-        tree.process(77, &["/usr/bin/gpiomon", "17"], 1000, &[]);
-        tree.link("proc/77/fd/3", "anon_inode:gpio-line");
-        tree.process(78, &["/usr/bin/other"], 1000, &[]);
-        tree.link("proc/78/fd/3", "/dev/null");
-        says(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
-        let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
-        says(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
     }
 }

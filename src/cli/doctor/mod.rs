@@ -14,11 +14,13 @@ use pinion_linux::Inventory;
 use pinion_runtime::latency::{self, Assessment, Fitness};
 
 use super::add;
+use super::complete::offering;
 use super::computer::Computer;
-use super::computer::board::Board;
+use super::computer::board::{self, Board};
+use super::computer::instance;
 use super::computer::klippy::klippys;
 use super::computer::manager::SYSTEMCTL;
-use super::computer::printer::{Printer, configs};
+use super::computer::printer::Printer;
 use super::computer::uses::Uses;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
@@ -26,7 +28,6 @@ use super::{failed, quietly};
 
 mod devices;
 mod host;
-mod instance;
 mod kernel;
 mod klipper;
 mod last_stop;
@@ -41,13 +42,13 @@ mod uses;
 
 pub(super) use uses::without_numpy;
 
-/// How to get the package, which is in no distribution's repository.
-const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
+/// How to get the package.
+const INSTALL: &str = "sudo apt install pinion-mcu, from the repository that docs/guide/install.md sets up (or in a folder with Pinion's sources: sudo make install)";
 /// How to install its files again.
-const REINSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install --reinstall ./target/deb/pinion-mcu_*.deb (or sudo make install)";
+const REINSTALL: &str =
+    "sudo apt install --reinstall pinion-mcu (or in a folder with Pinion's sources: sudo make install)";
 /// How to get a newer version.
-const UPGRADE: &str =
-    "in the folder with Pinion's sources: git pull && make deb && sudo apt install ./target/deb/pinion-mcu_*.deb";
+const UPGRADE: &str = "sudo apt update && sudo apt install pinion-mcu (or in the folder with Pinion's sources: git pull && sudo make install)";
 
 /// Options of `pinion doctor`.
 #[derive(Args, Clone, Debug)]
@@ -62,6 +63,9 @@ pub(super) struct DoctorArgs {
     /// Check the system whose files are below DIR, for example a mounted card
     #[arg(long, value_name = "DIR", default_value = "/", value_hint = ValueHint::DirPath)]
     root: PathBuf,
+    /// The board, if its device tree is not there, as on a mounted card
+    #[arg(long, value_name = "BOARD", value_parser = offering::<String>(&board::NAMES), hide_possible_values = true)]
+    board: Option<String>,
 }
 
 /// Prints the findings. Fails if something does not work.
@@ -70,13 +74,11 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
         Ok(checkout) => checkout,
         Err(error) => return failed(error),
     };
-    if !args.root.is_dir() {
-        return failed(format!(
-            "{}: there is no such folder: name the one where the system's files are, such as /mnt",
-            args.root.display()
-        ));
-    }
-    let mut groups = quietly(|| examine(&Computer::at(&args.root)));
+    let (computer, board) = match Computer::named(&args.root, args.board.as_deref()) {
+        Ok(found) => found,
+        Err(why) => return failed(why),
+    };
+    let mut groups = quietly(|| examine(&computer, board.as_ref()));
     if let Some(checkout) = &checkout {
         groups.push(Group::new("checkout", vec![klipper::finding(checkout)]));
     }
@@ -92,14 +94,13 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
     finding::finish(&page, &groups)
 }
 
-fn examine(computer: &Computer) -> Vec<Group> {
+fn examine(computer: &Computer, board: Option<&Board>) -> Vec<Group> {
     let (instances, configurations) = instance::instances(computer);
     let klippys = klippys(computer);
     let uarts = host::of_all(&klippys, Printer::uarts);
     let program = |path: &'static str| computer.is_this().then_some(Path::new(path));
     let inventory = computer.is_this().then(Inventory::scan);
-    let board = Board::of(computer, None).unwrap_or_default();
-    let uses = Uses::find(computer, board.as_ref(), None, inventory.as_ref());
+    let uses = Uses::find(computer, board, None, inventory.as_ref());
     let mut groups = vec![
         Group::new("last stop", vec![last_stop::finding(computer, SystemTime::now())]),
         Group::new("kernel", kernel::findings(computer, &instances)),
@@ -113,17 +114,17 @@ fn examine(computer: &Computer) -> Vec<Group> {
         Group::new(
             "pins and buses",
             [
-                devices::presence(computer),
+                devices::presence(computer, &uses.config_txt),
                 host::unchecked(&klippys),
                 outputs::released(computer),
-                leds::leds(computer, &host::of_all(&klippys, Printer::spi_leds)),
+                leds::leds(computer, &uses.config_txt, &host::of_all(&klippys, Printer::spi_leds)),
                 leds::line_leds(computer, &instances, &host::of_all(&klippys, Printer::line_leds)),
                 serial::ports(computer, &uarts),
                 uses::conflicts(&uses),
                 uses::no_lines(&uses),
-                uses::slow_buses(computer, &klippys),
+                uses::slow_buses(computer, &uses),
                 uses::numpy(computer, &klippys),
-                add::missing(computer, &configs(computer)),
+                add::missing(computer, &uses),
             ]
             .concat(),
         ),
@@ -133,11 +134,8 @@ fn examine(computer: &Computer) -> Vec<Group> {
     if let Some(inventory) = &inventory {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
         let pins = host::of_all(&klippys, Printer::numbered);
-        let lines = [
-            lines::header(computer, inventory, &lines::of_instances(&instances, &pins)),
-            lines::holders(computer, &inventory.chips),
-        ];
-        groups.insert(7, Group::new("lines", lines.concat()));
+        let pins = lines::of_instances(&instances, &pins);
+        groups.insert(7, Group::new("lines", lines::header(computer, inventory, &pins)));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups
@@ -159,7 +157,7 @@ fn latency(sample: Result<Assessment, String>) -> Finding {
 }
 
 #[cfg(test)]
-mod tests {
+pub(in crate::cli) mod tests {
     use super::super::computer::tests::Tree;
     use super::super::finding::Level;
     use super::*;
@@ -167,7 +165,7 @@ mod tests {
 
     /// Asserts that a check has found something with these words, and returns the remedy.
     #[track_caller]
-    pub(super) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
+    pub(in crate::cli) fn says(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
             finding.check == check && finding.status == status && finding.trouble.found().contains(words)
         };
@@ -179,7 +177,7 @@ mod tests {
     #[test]
     fn a_computer_without_any_files_has_no_errors() {
         let tree = Tree::new();
-        let groups = examine(&tree.computer());
+        let groups = examine(&tree.computer(), None);
         let errors: Vec<&Finding> =
             groups.iter().flat_map(|group| &group.findings).filter(|finding| finding.status == Level::Error).collect();
         assert!(errors.is_empty(), "{errors:?}");
@@ -208,7 +206,7 @@ mod tests {
         ] {
             tree.put(path, text);
         }
-        examine(&tree.computer());
+        examine(&tree.computer(), None);
         // A pipe without a writer, and a folder in a file's place.
         let pipe = tree.computer().path("/sys/kernel/realtime");
         fs::create_dir_all(pipe.parent().unwrap()).unwrap();
@@ -217,8 +215,8 @@ mod tests {
         // Processes that call themselves Pinion and klippy, and name the pipe.
         tree.process(7, &["/tmp/pinion", "run", "--config", "/sys/kernel/realtime"], 65534, &[]);
         tree.process(8, &["python3", "/tmp/klippy.py", "/sys/kernel/realtime"], 65534, &[]);
-        examine(&tree.computer());
-        examine(&tree.called_by(65534));
+        examine(&tree.computer(), None);
+        examine(&tree.called_by(65534), None);
     }
 
     #[test]
@@ -244,7 +242,7 @@ mod tests {
         tree.put("proc/device-tree/model", name);
         tree.put("sys/devices/system/cpu/isolated", name);
         tree.link("tmp/klipper_host_mcu", &format!("/dev/{name}"));
-        let groups = examine(&tree.computer());
+        let groups = examine(&tree.computer(), None);
         let page = finding::text(&groups);
         pinion_testkit::names::assert_plain(&page.to_string(), page.lines().count());
         let is_ours = |line: &str| {

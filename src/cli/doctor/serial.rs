@@ -3,13 +3,11 @@
 
 use std::collections::BTreeSet;
 
-use crate::cli::computer::board::{append, is_pi, pi_config};
+use crate::cli::computer::board::{append, is_pi, is_pi5, pi_config};
 use crate::cli::computer::device::Port;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
 use pinion_runtime::klippy::process::Process;
-
-use super::devices::is_pi5;
 
 const CHECK: &str = "serial";
 /// Programs that set up a Bluetooth chip on a serial port.

@@ -12,7 +12,7 @@ use pinion_linux::foreign::word;
 use pinion_linux::proc::stat_field;
 
 use super::INSTALL;
-use super::instance::{Instance, is_klipper_s};
+use crate::cli::computer::instance::{Instance, is_klipper_s};
 
 /// Number of the field in /proc/PID/stat that has the scheduling class.
 const POLICY: usize = 41;
@@ -236,9 +236,9 @@ pub(super) fn watchdog(computer: &Computer, instances: &[Instance], systemctl: O
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
 

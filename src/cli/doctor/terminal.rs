@@ -16,7 +16,7 @@ use pinion_runtime::Place;
 use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
 
 use super::host::printers;
-use super::instance::{Instance, unit_for};
+use crate::cli::computer::instance::{Instance, unit_for};
 
 const CHECK: &str = "terminal";
 
@@ -229,9 +229,9 @@ fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> b
 
 #[cfg(test)]
 mod tests {
-    use super::super::instance::instances;
     use super::super::tests::says;
     use super::*;
+    use crate::cli::computer::instance::instances;
     use crate::cli::computer::klippy::klippys;
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};

@@ -53,9 +53,10 @@ pub(super) fn conflicts(uses: &Uses) -> Vec<Finding> {
             let remedy = match select.and_then(|function| function.strip_prefix("spi")) {
                 Some(bus) => {
                     let mcu = match &one.source {
-                        Source::Printer(path) => uses.mcus.get(path).map_or("", String::as_str),
-                        _ => "",
+                        Source::Printer(path) => uses.printers.get(path).and_then(|(_, own)| own.keys().next()),
+                        _ => None,
                     };
+                    let mcu = mcu.map_or("", String::as_str);
                     format!(
                         "if that pin is the chip select: cs_pin: {mcu}:None and spi_bus: spidev{bus}.0 in printer.cfg; otherwise another pin (pinion pins --used)"
                     )
@@ -96,31 +97,21 @@ pub(super) fn no_lines(uses: &Uses) -> Vec<Finding> {
 }
 
 /// Buses whose clock is too slow for an accelerometer.
-pub(super) fn slow_buses(computer: &Computer, klippys: &[Klippy]) -> Vec<Finding> {
+pub(super) fn slow_buses(computer: &Computer, uses: &Uses) -> Vec<Finding> {
     const CHECK: &str = "i2c_clock";
-    let mut findings = Vec::new();
-    for printer in klippys.iter().filter_map(Klippy::printer) {
-        let own = printer.own_mcus(computer, None);
-        for section in printer.config.sections().iter().filter(|section| ACCELEROMETERS.contains(&section.kind())) {
-            let number = section.text("i2c_bus").and_then(|bus| bus.strip_prefix("i2c.")?.parse::<u32>().ok());
-            let Some(number) = number.filter(|_| own.contains_key(section.text("i2c_mcu").unwrap_or("mcu"))) else {
-                continue;
-            };
-            let file = format!("/sys/class/i2c-adapter/i2c-{number}/of_node/clock-frequency");
-            let bytes = fs::read(computer.path(file)).ok().and_then(|bytes| <[u8; 4]>::try_from(bytes).ok());
-            let Some(rate_hz) = bytes.map(u32::from_be_bytes).filter(|rate_hz| *rate_hz < ACCELEROMETER_HZ) else {
-                continue;
-            };
-            let found =
-                format!("[{}] loses samples: the clock of i2c.{number} is {} kHz", section.name, rate_hz / 1000);
-            let remedy = match is_pi(computer) {
-                true => format!("{}, and reboot", append(computer, "dtparam=i2c_arm_baudrate=400000")),
-                false => "set the clock of the bus to 400000 in the device tree".into(),
-            };
-            findings.push(Finding::warning(CHECK, found, remedy));
-        }
-    }
-    findings
+    let finding = |one: &Use| {
+        let section = uses.section(one).filter(|section| ACCELEROMETERS.contains(&section.kind()))?;
+        let Resource::I2c(number, _) = one.what else { return None };
+        let file = format!("/sys/class/i2c-adapter/i2c-{number}/of_node/clock-frequency");
+        let rate_hz = u32::from_be_bytes(fs::read(computer.path(file)).ok()?.try_into().ok()?);
+        let found = format!("[{}] loses samples: the clock of i2c.{number} is {} kHz", section.name, rate_hz / 1000);
+        let remedy = match is_pi(computer) {
+            true => format!("{}, and reboot", append(computer, "dtparam=i2c_arm_baudrate=400000")),
+            false => "set the clock of the bus to 400000 in the device tree".into(),
+        };
+        (rate_hz < ACCELEROMETER_HZ).then(|| Finding::warning(CHECK, found, remedy))
+    };
+    uses.all.iter().filter_map(finding).collect()
 }
 
 /// `[resonance_tester]` without numpy in klippy's Python.

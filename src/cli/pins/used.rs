@@ -24,9 +24,7 @@ pub(super) fn run(args: &PinsArgs) -> ExitCode {
 }
 
 fn shown(args: &PinsArgs) -> Result<(), String> {
-    let root = std::fs::canonicalize(&args.root).map_err(|error| format!("{}: {error}", args.root.display()))?;
-    let computer = Computer::at(&root);
-    let board = Board::of(&computer, args.board.as_deref())?;
+    let (computer, board) = Computer::named(&args.root, args.board.as_deref())?;
     let inventory = computer.is_this().then(Inventory::scan);
     let mut uses = Uses::find(&computer, board.as_ref(), None, inventory.as_ref());
     if let Some(filter) = &args.filter {

@@ -4,7 +4,7 @@
 use super::*;
 use crate::laid::speed_color;
 use crate::lens::Point;
-use crate::machine::{BED, HEAD, LOST};
+use crate::machine::{BED, HEAD, LOST, light_near};
 use crate::panel::OUT;
 use crate::scene::{Axis, Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Probe, Rgb, Servo, Strip};
 
@@ -134,6 +134,26 @@ fn a_light_of_a_strip_is_its_color_at_its_place() {
         let green = light(0.5, 1);
         assert!(green[1] > 230 && green[0] < 90, "{green:?}");
     }
+}
+
+/// While something is printed, the picture shows only that part.
+#[test]
+fn a_strip_has_its_color_in_a_near_view_too() {
+    let strips = vec![Strip { name: "strip".into(), lights: vec![[255, 0, 0], [0, 0, 255]] }];
+    let piece = Laid { from_mm: [100.0, 100.0, 0.2], to_mm: [120.0, 110.0, 0.2], mm_per_s: 50.0, begins: true };
+    let picture = drawn(&cartesian(), &Scene { strips, laid: vec![piece], ..at(&cartesian(), [0.0, 0.0, 0.2]) });
+    assert!(picture.sheets[0].view.is_some(), "it is near");
+    let light = |part: f64| picture.pixel(light_near(Layout::Wide.area(), part, 0));
+    let [red, blue] = [0.25, 0.75].map(light);
+    assert!(red[0] > 230 && red[2] < 90 && blue[2] > 230 && blue[0] < 90, "{red:?} {blue:?}");
+}
+
+#[test]
+fn both_carriages_are_there() {
+    let scene = at(&cartesian(), [60.0, 0.0, 20.0]);
+    let one = drawn(&cartesian(), &scene).find(HEAD);
+    let both = drawn(&cartesian(), &Scene { parked_mm: vec![[10.0, 110.0, 20.0]], ..scene }).find(HEAD);
+    assert!(both.0 > one.0 * 3 / 2 && both.1[0] < one.1[0] - 20.0, "{one:?} {both:?}");
 }
 
 #[test]
@@ -377,6 +397,7 @@ fn nothing_in_a_scene_breaks_the_picture() {
             seconds: f64::NAN,
             is_shut_down: true,
             nozzle_mm,
+            parked_mm: vec![nozzle_mm; many],
             axes: vec![Axis { name: name.into(), position_mm: f64::NAN, lost_steps: u64::MAX }; many],
             heaters: vec![
                 Heater { name: name.into(), celsius: f64::INFINITY, target_celsius: Some(f64::NAN), on: true };

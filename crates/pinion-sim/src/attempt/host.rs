@@ -2,6 +2,7 @@
 //! A klippy that this program starts, and its API server.
 
 use std::collections::HashMap;
+use std::fmt::{self, Display};
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -17,10 +18,13 @@ use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
-use super::stall::Stalls;
+use super::report::Progress;
+use super::time::Time;
 use super::{Attempt, rights};
+use crate::clock::{self, LIBRARY, Stop};
 use crate::own::serve::Folder;
 use pinion_printer_config::Trouble;
+use pinion_sim::{PaceWatch, Recorder, SimProbe};
 
 /// The end of a message.
 const END: u8 = 3;
@@ -32,8 +36,15 @@ const START: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(30);
 /// Time between two reads of klippy's state while a command runs.
 const LOOK: Duration = Duration::from_secs(5);
-/// How long klippy has to end in order.
+/// How long klippy is left alone when it is ready, as people do. It fills its display then: homing in the first second would
+/// come behind that, too late.
+const FIRST_MOMENTS: Duration = Duration::from_secs(3);
+/// How long klippy has to end in order, in real time.
 const END_TIME: Duration = Duration::from_secs(3);
+/// Time between two looks at an API that is not there yet.
+const LOOK_FOR_API: Duration = Duration::from_millis(50);
+/// Time between two reads of the path. The printer keeps half a second of an axis at 32,000 steps per second.
+const READ_PATH: Duration = Duration::from_millis(50);
 
 /// The result of a command.
 #[derive(Debug)]
@@ -44,6 +55,36 @@ pub(super) enum Refused {
     Late,
     /// klippy is gone.
     Gone(String),
+}
+
+impl Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Refused::Error(words) => f.write_str(words),
+            Refused::Late => f.write_str("it takes too long"),
+            Refused::Gone(why) => write!(f, "klippy is gone: {why}"),
+        }
+    }
+}
+
+impl From<Stop> for Refused {
+    fn from(stop: Stop) -> Refused {
+        Refused::Gone(stop.to_string())
+    }
+}
+
+/// Why klippy did not start.
+pub(super) enum NoStart {
+    /// It takes no part in the printer's clock: its Python loads no library.
+    Alone,
+    /// Anything else.
+    Trouble(Trouble),
+}
+
+impl From<Trouble> for NoStart {
+    fn from(trouble: Trouble) -> NoStart {
+        NoStart::Trouble(trouble)
+    }
 }
 
 /// The number of the process that this program started, so that nothing of it stays when the program ends.
@@ -73,8 +114,13 @@ pub(super) struct Host {
     answers: HashMap<u64, Value>,
     /// klippy's output since the last command.
     pub(super) said: Vec<String>,
-    /// How long it and the MCUs waited for a processor.
-    pub(super) stalls: Stalls,
+    pub(super) time: Time,
+    /// Records the nozzle's path while time passes.
+    pub(super) recorder: Option<Recorder>,
+    /// Watches how fast the motors are.
+    pub(super) paces: Option<PaceWatch>,
+    pub(super) progress: Progress,
+    probe: SimProbe,
 }
 
 impl Host {
@@ -82,20 +128,34 @@ impl Host {
     ///
     /// # Errors
     ///
-    /// It cannot be started, or opens no API.
-    pub(super) fn start(attempt: &Attempt, folder: &Folder) -> Result<Host, Trouble> {
+    /// It cannot be started, does not take part in the clock, or opens no API.
+    pub(super) fn start(attempt: &Attempt, folder: &Folder, probe: &SimProbe, mut time: Time) -> Result<Host, NoStart> {
         let Attempt { klipper, python, running, .. } = attempt;
         let program = klipper.join("klippy/klippy.py");
         let failed = |cause: String| Trouble::new(cause).of(program.display());
         if !program.is_file() {
             let trouble = failed("there is no klippy".into());
-            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR"));
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR").into());
         }
         let socket = folder.path.join("klippy.sock");
         let _ = std::fs::remove_file(&socket);
         let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
-        let mut command = rights::confined(python);
-        command.arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
+        let mut command = rights::confined();
+        let turns = match &mut time {
+            Time::Real(..) => None,
+            // The library is for 64 bits.
+            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
+            Time::One(clock) => {
+                let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
+                // What follows env, and nothing before it, has the library.
+                command.arg("env").arg(format!("LD_PRELOAD={}", library()?.display()));
+                command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, &folder.path)));
+                // The same order of names in each run; one thread for numpy.
+                command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
+                Some((ours, theirs))
+            }
+        };
+        command.arg(python).arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
         command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
         command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
         // A Ctrl-C ends this program, which ends klippy.
@@ -104,26 +164,108 @@ impl Host {
             failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
         })?;
         running.0.store(child.id().cast_signed(), Ordering::SeqCst);
-        let stalls = Stalls::watch(child.id());
-        let until = Instant::now() + START;
-        let api = loop {
-            if let Ok(api) = UnixStream::connect(&socket) {
-                break api;
-            }
-            let ended = child.try_wait().ok().flatten();
-            if ended.is_some() || Instant::now() > until {
-                running.0.store(0, Ordering::SeqCst);
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(no_start(&folder.path, ended.is_some()).of(program.display()));
-            }
-            thread::sleep(Duration::from_millis(50));
-        };
+        let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, _)| ours), &socket, folder);
+        let api = opened.inspect_err(|_| {
+            running.0.store(0, Ordering::SeqCst);
+            let _ = child.kill();
+            let _ = child.wait();
+        });
+        let api = api.map_err(|error| match error {
+            NoStart::Trouble(trouble) => NoStart::Trouble(trouble.of(program.display())),
+            NoStart::Alone => NoStart::Alone,
+        })?;
         let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
         let running = running.clone();
-        let mut host = Host { child, running, socket, api, buffer, next_id: 0, answers, said, stalls };
+        let (recorder, paces, progress, probe) = (None, None, Progress::new(attempt.form), probe.clone());
+        let next_id = 0;
+        let mut host = Host {
+            child,
+            running,
+            socket,
+            api,
+            buffer,
+            next_id,
+            answers,
+            said,
+            time,
+            recorder,
+            paces,
+            progress,
+            probe,
+        };
         let subscribed = host.subscribe();
-        subscribed.map(|()| host).map_err(|refused| failed(format!("its API does not answer: {refused:?}")))
+        match subscribed {
+            Ok(()) => Ok(host),
+            Err(refused) => Err(failed(format!("its API does not answer: {refused:?}")).into()),
+        }
+    }
+
+    /// Waits until klippy takes part in the clock and has opened its API.
+    fn await_api(
+        child: &mut Child,
+        time: &mut Time,
+        turns: Option<UnixStream>,
+        socket: &Path,
+        folder: &Folder,
+    ) -> Result<UnixStream, NoStart> {
+        if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
+            match clock.await_player(turns) {
+                Ok(()) => {}
+                Err(Stop::Computes) => return Err(NoStart::Alone),
+                Err(_) => return Err(no_start(&folder.path, true).into()),
+            }
+        }
+        let until = time.now() + START;
+        loop {
+            if let Ok(api) = UnixStream::connect(socket) {
+                return Ok(api);
+            }
+            let passed = time.sleep(LOOK_FOR_API);
+            let ended = passed.is_err() || child.try_wait().ok().flatten().is_some();
+            if ended || time.now() > until {
+                return Err(no_start(&folder.path, ended).into());
+            }
+        }
+    }
+
+    /// Gives the clock away, for another klippy.
+    pub(super) fn take_time(&mut self) -> Time {
+        std::mem::replace(&mut self.time, Time::Real(Instant::now(), Arc::default()))
+    }
+
+    /// klippy's process.
+    pub(super) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether klippy runs.
+    pub(super) fn is_there(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
+    pub(super) fn now(&self) -> Duration {
+        self.time.now()
+    }
+
+    /// Lets time pass.
+    pub(super) fn sleep(&mut self, span: Duration) {
+        let until = self.now() + span;
+        while self.now() < until {
+            let next = until.min(self.now() + READ_PATH);
+            // A klippy that is gone does not answer the next question.
+            if self.time.sleep(next.saturating_sub(self.now())).is_err() {
+                return;
+            }
+            self.look();
+        }
+    }
+
+    /// Does what has to be done now and then.
+    fn look(&mut self) {
+        let now = self.probe.now();
+        self.recorder.iter_mut().for_each(|recorder| recorder.read(now));
+        self.paces.iter_mut().for_each(|paces| paces.read(now));
+        self.progress.show(self.time.now());
     }
 
     /// Has klippy send its output.
@@ -134,7 +276,7 @@ impl Host {
     /// A call of the API.
     pub(super) fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
         let id = self.send(method, params)?;
-        self.answer(id, Instant::now() + limit)
+        self.answer(id, self.now() + limit)
     }
 
     /// Sends a question, and returns its number.
@@ -142,12 +284,13 @@ impl Host {
         self.next_id += 1;
         let mut request = json!({ "id": self.next_id, "method": method, "params": params }).to_string().into_bytes();
         request.push(END);
-        self.api.write_all(&request).map_err(|error| Refused::Gone(error.to_string()))?;
+        self.api.write_all(&request).map_err(|_| Refused::Gone(Stop::Ended.to_string()))?;
+        self.time.poke();
         Ok(self.next_id)
     }
 
     /// Waits for the answer to a question.
-    fn answer(&mut self, id: u64, until: Instant) -> Result<Value, Refused> {
+    fn answer(&mut self, id: u64, until: Duration) -> Result<Value, Refused> {
         loop {
             let message = match self.answers.remove(&id) {
                 Some(message) => message,
@@ -172,7 +315,7 @@ impl Host {
         }
     }
 
-    fn message(&mut self, until: Instant) -> Result<Value, Refused> {
+    fn message(&mut self, until: Duration) -> Result<Value, Refused> {
         let mut piece = [0; 4096];
         loop {
             if let Some(end) = self.buffer.iter().position(|byte| *byte == END) {
@@ -180,17 +323,19 @@ impl Host {
                 self.buffer.drain(..=end);
                 return Ok(message);
             }
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() {
+            if self.now() >= until {
                 return Err(Refused::Late);
             }
+            let next = until.min(self.now() + READ_PATH);
+            let is_there = self.time.await_bytes(&self.api, next)?;
+            self.look();
+            if !is_there {
+                continue;
+            }
             let gone = |cause: &str| Refused::Gone(cause.to_owned());
-            self.api.set_read_timeout(Some(left)).map_err(|error| gone(&error.to_string()))?;
             match self.api.read(&mut piece) {
-                Ok(0) => return Err(gone("klippy ended")),
+                Ok(0) => return Err(Stop::Ended.into()),
                 Ok(read) => self.buffer.extend_from_slice(&piece[..read]),
-                Err(error) if matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => {
-                }
                 Err(error) => return Err(gone(&error.to_string())),
             }
             if self.buffer.len() > MESSAGE_MAX {
@@ -203,16 +348,35 @@ impl Host {
     pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
         self.said.clear();
         let id = self.send("gcode/script", json!({ "script": script }))?;
-        let until = Instant::now() + limit;
+        let until = self.now() + limit;
         let mut stopped = None;
         loop {
-            match self.answer(id, until.min(Instant::now() + LOOK)) {
+            match self.answer(id, until.min(self.now() + LOOK)) {
                 Err(Refused::Late) if stopped.is_some() => return Err(Refused::Error(stopped.unwrap_or_default())),
-                Err(Refused::Late) if Instant::now() < until => {
+                Err(Refused::Late) if self.now() < until => {
                     let (state, words) = self.state()?;
                     stopped = (state != "ready").then_some(words);
                 }
                 answer => return answer.map(drop),
+            }
+        }
+    }
+
+    /// Waits until klippy is ready. The error is its words.
+    pub(super) fn until_ready(&mut self, limit: Duration) -> Result<(), String> {
+        let until = self.now() + limit;
+        loop {
+            match self.state() {
+                Ok((state, _)) if state == "ready" => {
+                    self.sleep(FIRST_MOMENTS);
+                    return Ok(());
+                }
+                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
+                Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
+                Ok(_) => self.sleep(Duration::from_millis(100)),
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if self.now() < until && self.reconnect() => {}
+                Err(refused) => return Err(format!("klippy does not answer: {refused}")),
             }
         }
     }
@@ -240,27 +404,30 @@ impl Host {
     }
 
     /// Another connection, which stops the printer while a command runs.
-    pub(super) fn stop(&self) {
+    pub(super) fn stop(&mut self) {
         if let Ok(mut api) = UnixStream::connect(&self.socket) {
             let _ = api.write_all(b"{\"id\":1,\"method\":\"emergency_stop\"}\x03");
+            self.time.poke();
+            // klippy must have read it before the connection closes.
+            let _ = self.time.sleep(LOOK_FOR_API);
         }
     }
 
     /// Has klippy reset the MCUs and restart itself.
     pub(super) fn firmware_restart(&mut self) {
-        let until = Instant::now() + ANSWER;
+        let until = self.now() + ANSWER;
         // The answer may come before the restart, or never.
         let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
-        while self.state().is_ok() && Instant::now() < until {
-            thread::sleep(Duration::from_millis(50));
+        while self.state().is_ok() && self.now() < until {
+            self.sleep(LOOK_FOR_API);
         }
         self.reconnect();
     }
 
     /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
     pub(super) fn reconnect(&mut self) -> bool {
-        let until = Instant::now() + START;
-        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < until {
+        let until = self.now() + START;
+        while matches!(self.child.try_wait(), Ok(None)) && self.now() < until {
             if let Ok(api) = UnixStream::connect(&self.socket) {
                 self.api = api;
                 self.buffer.clear();
@@ -269,7 +436,7 @@ impl Host {
                     return true;
                 }
             }
-            thread::sleep(Duration::from_millis(50));
+            self.sleep(LOOK_FOR_API);
         }
         false
     }
@@ -293,6 +460,18 @@ impl Host {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// The library that gives klippy the printer's clock.
+fn library() -> Result<PathBuf, Trouble> {
+    let program = std::env::current_exe().and_then(std::fs::canonicalize).unwrap_or_default();
+    let folder = program.parent().unwrap_or(Path::new("/"));
+    // cargo's place, and the package's.
+    let places = ["deps", "../lib/pinion-sim"].map(|place| folder.join(place).join(LIBRARY));
+    places.into_iter().find(|place| place.is_file()).ok_or_else(|| {
+        Trouble::new(format!("there is no {LIBRARY} beside {}", program.display()))
+            .remedy("install the whole package, or add --real-time")
+    })
 }
 
 /// The reason why klippy opened no API, in its last words, and what helps.

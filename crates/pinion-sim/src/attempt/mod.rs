@@ -2,28 +2,32 @@
 //! `pinion sim PRINTER.CFG --try`: a klippy on the user's configuration does what every owner does after a change.
 
 mod host;
-mod place;
+pub(crate) mod paced;
+pub(crate) mod place;
+pub(crate) mod print;
 mod report;
 pub(crate) mod rights;
-mod stall;
 mod steps;
+pub(crate) mod time;
 mod trial;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::time::Duration;
 
 use clap::builder::PossibleValuesParser;
 use pinion_printer_config::{Place, Trouble};
 use pinion_sim::SimProbe;
 
 use crate::own::serve::{Folder, Own};
-use host::Host;
 pub(crate) use host::Running;
+use host::{Host, NoStart};
+use print::PrintOptions;
 pub(crate) use report::Form;
 use report::{Outcome, Report};
 use steps::STEPS;
+use time::Time;
 use trial::Trial;
 
 /// The options of `--try`.
@@ -33,6 +37,12 @@ pub(crate) struct Attempt {
     pub(crate) python: PathBuf,
     /// A file to print in place of the small one.
     pub(crate) gcode: Option<PathBuf>,
+    /// Let klippy run at this pace in place of the trial.
+    pub(crate) speed: Option<f64>,
+    /// Print a file in place of the trial.
+    pub(crate) print: Option<PrintOptions>,
+    /// klippy and the printer have the computer's clock.
+    pub(crate) real_time: bool,
     /// Only these steps, if there are any.
     pub(crate) only: Vec<String>,
     pub(crate) form: Form,
@@ -40,23 +50,26 @@ pub(crate) struct Attempt {
     pub(crate) running: Running,
 }
 
-/// Tries a printer. Returns whether nothing failed. `ended` is set when the program is asked to end.
+/// Tries a printer. Returns whether nothing failed, or nothing if klippy takes no part in the printer's clock. `ended` is
+/// set when the program is asked to end.
 pub(crate) fn run(
     attempt: &Attempt,
     (own, printer): (&Own, &Path),
     folder: &Folder,
     probe: &SimProbe,
+    time: Time,
     ended: &AtomicBool,
-) -> bool {
+) -> Option<bool> {
     let mut report = Report::new(attempt.form);
-    let since = Instant::now();
-    report.progress("klippy starts");
-    let host = match Host::start(attempt, folder) {
+    let began = time.now();
+    let host = match Host::start(attempt, folder, probe, time) {
         Ok(host) => host,
-        Err(trouble) => {
-            report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, since);
+        Err(NoStart::Alone) => return None,
+        Err(_) if ended.load(Ordering::SeqCst) => return Some(false),
+        Err(NoStart::Trouble(trouble)) => {
+            report.add("ready", Outcome::Failed { cause: trouble.to_string(), place: None }, Duration::ZERO);
             report.end(printer, Some(&folder.path));
-            return false;
+            return Some(false);
         }
     };
     let mut trial = Trial::new(attempt, folder, own, probe, host);
@@ -67,30 +80,37 @@ pub(crate) fn run(
         if !attempt.only.is_empty() && step.name != "ready" && !attempt.only.iter().any(|only| only == step.name) {
             continue;
         }
-        let since = if step.name == "ready" { since } else { Instant::now() };
-        report.progress(step.name);
+        let since = if step.name == "ready" { began } else { trial.host.now() };
+        let now = trial.host.now();
+        trial.host.progress.begin(step.name, now);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
             None => trial.tried(step),
         };
+        if ended.load(Ordering::SeqCst) {
+            break;
+        }
         if outcome.is_failure() {
             trial.recover(step.name);
         }
-        report.add(step.name, outcome, since);
+        report.add(step.name, outcome, trial.host.now().saturating_sub(since));
+    }
+    if ended.load(Ordering::SeqCst) {
+        return Some(false);
     }
     if let Err(trouble) = trial.keep() {
         log::warn!("{trouble}");
     }
     drop(trial);
     report.end(printer, Some(&folder.path));
-    report.passed() && !ended.load(Ordering::SeqCst)
+    Some(report.passed())
 }
 
 /// Reports a mistake that is found before klippy starts.
 pub(crate) fn refused(printer: &Path, mistake: Trouble, form: Form) -> ExitCode {
     let mut report = Report::new(form);
     let (cause, place) = without_place(mistake);
-    report.add("read", Outcome::Failed { cause, place }, Instant::now());
+    report.add("read", Outcome::Failed { cause, place }, Duration::ZERO);
     report.end(printer, None);
     ExitCode::FAILURE
 }
@@ -117,7 +137,7 @@ pub(crate) fn steps() -> PossibleValuesParser {
 /// There is none.
 pub(crate) fn klipper(named: Option<PathBuf>) -> Result<PathBuf, Trouble> {
     named.ok_or_else(|| {
-        Trouble::new("--try needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
+        Trouble::new("it needs a klippy").remedy("name a checkout of Klipper or Kalico: --klipper ~/klipper")
     })
 }
 

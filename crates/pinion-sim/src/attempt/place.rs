@@ -23,7 +23,7 @@ fn pin(config: &Config, name: &str) -> Option<Place> {
 }
 
 /// The line that a message of klippy is about.
-pub(super) fn place_of(config: &Config, message: &str) -> Option<Place> {
+pub(crate) fn place_of(config: &Config, message: &str) -> Option<Place> {
     let words: Vec<&str> = message.split_whitespace().collect();
     let texts = quoted(message);
     let lower = message.to_lowercase();

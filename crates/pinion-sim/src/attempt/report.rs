@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The report of `--try`: one line for each step, then a verdict.
 
-use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -21,11 +20,6 @@ pub(super) enum Outcome {
         cause: String,
         place: Option<Place>,
     },
-    /// This computer made klippy or an MCU wait for so long that the step says nothing about the printer.
-    Slow {
-        cause: String,
-        stall: Duration,
-    },
     /// It was not tried, and why.
     Skipped(String),
 }
@@ -41,7 +35,7 @@ impl Outcome {
 
     /// Whether nothing shows that the step works.
     pub(super) fn is_failure(&self) -> bool {
-        matches!(self, Outcome::Failed { .. } | Outcome::Slow { .. })
+        matches!(self, Outcome::Failed { .. })
     }
 
     /// The result's word, its text, and the place of a mistake.
@@ -50,11 +44,6 @@ impl Outcome {
             Outcome::Passed(seen) => ("passed", seen.clone(), None),
             Outcome::Skipped(why) => ("skipped", why.clone(), None),
             Outcome::Failed { cause, place } => ("failed", cause.clone(), place.as_ref()),
-            Outcome::Slow { cause, stall } => {
-                let waited = format!("klippy or an MCU waited {:.2} s for a processor", stall.as_secs_f64());
-                let remedy = "end other programs, or add -r as root";
-                ("slow", format!("this computer is too slow: {waited}, and klippy says \"{cause}\": {remedy}"), None)
-            }
         }
     }
 }
@@ -73,36 +62,85 @@ pub(crate) enum Form {
     Json,
 }
 
+/// A line on a terminal about what is under way.
+pub(super) struct Progress {
+    is_shown: bool,
+    doing: String,
+    /// When it began, by the printer's clock and by the computer's.
+    began: (Duration, Instant),
+    shown: Option<Instant>,
+    /// What follows the times.
+    more: String,
+}
+
+/// Real time between two lines.
+const SHOW: Duration = Duration::from_millis(200);
+
+impl Progress {
+    pub(super) fn new(form: Form) -> Progress {
+        let is_shown = form == Form::Lines && std::io::stdout().is_terminal();
+        Progress {
+            is_shown,
+            doing: String::new(),
+            began: (Duration::ZERO, Instant::now()),
+            shown: None,
+            more: String::new(),
+        }
+    }
+
+    /// Something begins, at this time of the printer.
+    pub(super) fn begin(&mut self, doing: &str, now: Duration) {
+        (self.doing, self.began, self.shown) = (plain(doing).into_owned(), (now, Instant::now()), None);
+        self.more.clear();
+        self.show(now);
+    }
+
+    /// What follows the times from now on.
+    pub(super) fn say(&mut self, more: String) {
+        self.more = more;
+    }
+
+    /// Takes the line away.
+    pub(super) fn end(&self) {
+        if self.is_shown {
+            let _ = write!(std::io::stdout(), "\r{ERASE_LINE}");
+        }
+    }
+
+    /// Shows the line, if the last one is old.
+    pub(super) fn show(&mut self, now: Duration) {
+        if !self.is_shown || self.shown.is_some_and(|shown| shown.elapsed() < SHOW) {
+            return;
+        }
+        self.shown = Some(Instant::now());
+        let (printer, computer) = (now.saturating_sub(self.began.0).as_secs(), self.began.1.elapsed().as_secs());
+        let mut out = std::io::stdout();
+        let Progress { doing, more, .. } = self;
+        let _ = write!(out, "\r{ERASE_LINE}  ...  {doing}: {printer} s of the printer in {computer} s{more}");
+        let _ = out.flush();
+    }
+}
+
 /// All steps.
 pub(super) struct Report {
     form: Form,
     steps: Vec<Step>,
+    began: Instant,
 }
 
 impl Report {
     pub(super) fn new(form: Form) -> Report {
-        Report { form, steps: Vec::new() }
+        Report { form, steps: Vec::new(), began: Instant::now() }
     }
 
-    /// On a terminal, what is under way.
-    pub(super) fn progress(&self, doing: impl Display) {
-        let mut out = std::io::stdout();
-        if self.form == Form::Lines && out.is_terminal() {
-            let _ = write!(out, "\r{ERASE_LINE}  ...  {}", plain(&doing.to_string()));
-            let _ = out.flush();
-        }
-    }
-
-    /// A step ended.
-    pub(super) fn add(&mut self, name: &'static str, outcome: Outcome, since: Instant) {
-        let took = since.elapsed();
+    /// A step ended. It took this long on the printer.
+    pub(super) fn add(&mut self, name: &'static str, outcome: Outcome, took: Duration) {
         if self.form == Form::Lines {
             let mut page = Page::default();
             let (result, text, place) = outcome.parts();
             let mark = match result {
                 "passed" => "ok",
                 "skipped" => "-",
-                "slow" => "slow",
                 _ => "FAIL",
             };
             let place = place.map_or_else(String::new, |place| format!("{place}: "));
@@ -138,24 +176,15 @@ impl Report {
         match self.form {
             Form::Json => page = Page::json(&format!("{}\n", self.json(printer, folder))),
             Form::Lines => {
-                let names = |slow: bool| -> Vec<&str> {
-                    let of_kind = |step: &&Step| matches!(step.outcome, Outcome::Slow { .. }) == slow;
-                    self.failed().filter(of_kind).map(|step| step.name).collect()
-                };
-                let (failed, slow) = (names(false), names(true));
+                let failed: Vec<&str> = self.failed().map(|step| step.name).collect();
                 let name = printer.display();
-                match (&failed[..], &slow[..]) {
-                    ([], []) => page.line(format_args!("{name} works here: everything that was tried passed")),
-                    ([], slow) => {
-                        let steps = slow.join(", ");
-                        page.line(format_args!(
-                            "{name} was not tried to the end: this computer is too slow for {steps}"
-                        ));
-                    }
-                    (failed, _) => {
-                        page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", ")));
-                    }
+                match &failed[..] {
+                    [] => page.line(format_args!("{name} works here: everything that was tried passed")),
+                    failed => page.line(format_args!("{name} does NOT work here: {} failed", failed.join(", "))),
                 }
+                let printer: Duration = self.steps.iter().map(|step| step.took).sum();
+                let (printer, computer) = (printer.as_secs_f64(), self.began.elapsed().as_secs_f64());
+                page.line(format_args!("{printer:.0} s of the printer took {computer:.0} s"));
                 if let Some(folder) = folder {
                     page.line(format_args!("the logs and the copy for klippy are in {}", folder.display()));
                 }

@@ -76,9 +76,9 @@ fn user_of_trial(caller: Option<u32>, owner: Option<u32>) -> u32 {
     [caller, owner].into_iter().flatten().find(|uid| *uid != 0).unwrap_or(NOBODY)
 }
 
-/// A command in which klippy has no capability and gets no rights. It ends when this program does, however that ends. It
+/// A command that runs the program of its arguments, in which klippy has no capability and gets no rights. It ends when this program does, however that ends. It
 /// has no network if the kernel permits that.
-pub(super) fn confined(python: &Path) -> Command {
+pub(crate) fn confined() -> Command {
     // Without a network of its own, it still has this one.
     let alone = ["--user", "--map-current-user", "--net"];
     let may_be_alone = Command::new("unshare").args(alone).arg("true").stderr(Stdio::null()).status();
@@ -91,7 +91,6 @@ pub(super) fn confined(python: &Path) -> Command {
         Command::new("setpriv")
     };
     command.args(["--no-new-privs", "--inh-caps=-all", "--ambient-caps=-all", "--pdeathsig=KILL"]);
-    command.arg(python);
     command
 }
 

@@ -4,31 +4,26 @@
 use std::fs;
 use std::io;
 use std::path::PathBuf;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use pinion_printer_config::{Config, Place, Section, Trouble};
 use pinion_sim::{Recorder, SimProbe, write_svg};
 use serde_json::Value;
 
 use super::Attempt;
-use super::host::{Host, Refused};
+use super::host::{Host, NoStart, Refused};
 use super::place::place_of;
 use super::report::Outcome;
 use super::steps::{Step, is_first};
 use crate::camera::picture;
-use crate::own::serve::{Folder, Own, section_of};
+use crate::own::serve::{Folder, Own};
 
 /// How long homing, leveling or a macro may take.
-pub(super) const LONG: Duration = Duration::from_secs(400);
+pub(super) const LONG: Duration = Duration::from_secs(1800);
 /// How long it may take until a fan turns.
 pub(super) const SOON: Duration = Duration::from_secs(30);
 /// How long klippy has to be ready.
 const READY: Duration = Duration::from_secs(90);
-/// How long klippy has to learn the MCUs' clocks, and how far off an MCU's rate may be.
-const CLOCKS: Duration = Duration::from_secs(10);
-const CLOCKS_OFF: f64 = 1e-4;
-
 /// Words of a stop because a computer is too busy.
 const BUSY: [&str; 7] = [
     "Timer too close",
@@ -39,12 +34,6 @@ const BUSY: [&str; 7] = [
     "Communication timeout during homing",
     "Timeout on wait for",
 ];
-/// How often a step is repeated because of them.
-const TRIES: u32 = 4;
-
-/// Shortest wait for a processor that klippy can stop for: while it homes with several MCUs, it has 25 ms.
-const STALL: Duration = Duration::from_millis(20);
-
 /// What is tried, and how far it came.
 pub(super) struct Trial<'a> {
     pub(super) attempt: &'a Attempt,
@@ -134,34 +123,25 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Runs a step. It is repeated if klippy stopped because it or an MCU was late. If this computer made them late each
-    /// time, the step says nothing about the printer. Any other failure of a late klippy is tried once more: a probe that
-    /// answers late homes at another height.
+    /// Runs a step.
     pub(super) fn tried(&mut self, step: &Step) -> Outcome {
-        let mut repeated = 0;
-        loop {
-            self.host.stalls.take();
-            let outcome = (step.run)(self).map_or_else(|outcome| outcome, Outcome::Passed);
-            let stall = self.host.stalls.take();
-            let Outcome::Failed { cause, .. } = &outcome else { return outcome };
-            if self.broken.is_some() {
-                return outcome;
+        let outcome = (step.run)(self).map_or_else(|outcome| outcome, Outcome::Passed);
+        match outcome {
+            Outcome::Failed { cause, place }
+                if self.attempt.real_time && BUSY.iter().any(|words| cause.contains(words)) =>
+            {
+                let cause = format!("{cause} (this computer may be too busy: leave --real-time out)");
+                Outcome::Failed { cause, place }
             }
-            let is_busy = BUSY.iter().any(|words| cause.contains(words));
-            let is_late = stall >= STALL;
-            let repeats = if is_busy { TRIES } else { u32::from(is_late) };
-            if repeated >= repeats || !self.begins_again(step.name) {
-                let is_slow = is_busy && is_late;
-                return if is_slow { Outcome::Slow { cause: cause.clone(), stall } } else { outcome };
-            }
-            repeated += 1;
+            outcome => outcome,
         }
     }
 
     /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
-    fn restart(&mut self) -> Result<(), Trouble> {
+    fn restart(&mut self) -> Result<(), NoStart> {
         self.host.end();
-        self.host = Host::start(self.attempt, self.folder)?;
+        let time = self.host.take_time();
+        self.host = Host::start(self.attempt, self.folder, self.probe, time)?;
         Ok(())
     }
 
@@ -191,41 +171,7 @@ impl<'a> Trial<'a> {
 
     /// Waits until klippy is ready. The error is its words.
     pub(super) fn until_ready(&mut self) -> Result<(), String> {
-        let until = Instant::now() + READY;
-        loop {
-            match self.host.state() {
-                Ok((state, _)) if state == "ready" => {
-                    self.until_clocks_agree();
-                    return Ok(());
-                }
-                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
-                Ok((_, words)) if Instant::now() > until => return Err(format!("klippy is not ready: {words}")),
-                Ok(_) => thread::sleep(Duration::from_millis(100)),
-                // A klippy that finds its MCU shut down restarts both.
-                Err(Refused::Gone(_)) if Instant::now() < until && self.host.reconnect() => {}
-                Err(refused) => return Err(format!("klippy does not answer: {refused:?}")),
-            }
-        }
-    }
-
-    /// Waits until klippy knows the MCUs' clocks. Right after its start on a busy computer it can be milliseconds wrong, and
-    /// then it is late when it homes.
-    fn until_clocks_agree(&mut self) {
-        let names: Vec<String> = self.own.mcus.iter().map(|mcu| section_of(mcu)).collect();
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        let until = Instant::now() + CLOCKS;
-        while Instant::now() < until {
-            let status = self.host.query(&names).unwrap_or_default();
-            let off = |mcu: &Value| {
-                let [now, nominal] =
-                    [&mcu["last_stats"]["freq"], &mcu["mcu_constants"]["CLOCK_FREQ"]].map(Value::as_f64);
-                now.zip(nominal).is_none_or(|(now, nominal)| (now / nominal - 1.0).abs() > CLOCKS_OFF)
-            };
-            if !names.iter().any(|name| off(&status[*name])) {
-                return;
-            }
-            thread::sleep(Duration::from_millis(200));
-        }
+        self.host.until_ready(READY)
     }
 
     /// The same for another klippy. Some wait for the user if they find an MCU shut down.

@@ -85,8 +85,6 @@ struct Claims<'a> {
     /// The pins of `[duplicate_pin_override]`.
     free: HashSet<(String, String)>,
     claims: HashMap<(String, String), Claim>,
-    /// The names that the pins of an MCU were claimed by.
-    named: HashMap<(String, String), String>,
 }
 
 /// Checks that each pin has one owner.
@@ -99,7 +97,7 @@ pub(super) fn check(config: &Config, aliases: &Aliases, mcus: &[String]) -> Resu
         config.section("duplicate_pin_override").map(|section| section.list("pins", ',')).unwrap_or_default();
     let place = |pin: Pin| (pin.chip, pin.name);
     let free = overrides.iter().filter_map(|text| Pin::parse(text, false, false).ok()).map(place).collect();
-    let mut claims = Claims { config, aliases, mcus, free, claims: HashMap::new(), named: HashMap::new() };
+    let mut claims = Claims { config, aliases, mcus, free, claims: HashMap::new() };
     for section in config.sections() {
         for setting in section.settings() {
             let Some(role) = Role::of(section, &setting.key) else { continue };
@@ -124,8 +122,14 @@ impl Claims<'_> {
                 let cause = format!("Unknown pin chip name '{}'", pin.chip);
                 return refused(cause, "correct it, or add the section of the chip");
             }
-            return self.driver_has_diag(section, setting, &pin);
+            return Ok(());
         }
+        // `host:None` is no pin, and names the MCU of a chip that is alone on its bus.
+        if pin.name == "None" {
+            return Ok(());
+        }
+        // Two names may be those of one pin.
+        let pin = self.aliases.resolve(&pin);
         let place = (pin.chip.clone(), pin.name.clone());
         if let Some(known) = self.claims.get(&place).filter(|_| !self.free.contains(&place)) {
             if role.share.is_none() || role.share != known.share.as_deref() {
@@ -136,46 +140,21 @@ impl Claims<'_> {
             }
             return Ok(());
         }
-        if let Some(why) = self.aliases.reserved(&pin) {
-            return refused(format!("pin {} is reserved for {why}", pin.name), "name another pin");
-        }
-        let real = (pin.chip.clone(), self.aliases.resolve(&pin).name);
-        let named = self.named.entry(real).or_insert_with(|| pin.name.clone());
-        if *named != pin.name {
-            return refused(format!("pin {} is an alias for {named}", pin.name), "name a pin of its own");
-        }
         self.claims.insert(place, Claim { pin, share: role.share.map(str::to_owned) });
         Ok(())
     }
 
-    /// Whether some section may be a chip with this name.
+    /// Whether some section may be a chip with this name. A plugin's has a name like its section's.
     fn is_chip(&self, chip: &str) -> bool {
         let is_probe = |kind: &str| kind.contains("probe") || kind == "bltouch" || kind == "smart_effector";
         self.config.sections().iter().any(|section| {
             let kind = section.kind();
-            kind_of(kind) == Kind::Strange
+            let is_plugins = kind_of(kind) == Kind::Strange;
+            is_plugins && (chip == "probe" || section.name.contains(chip) || chip.contains(kind))
                 || section.own_name() == Some(chip)
                 || kind == chip
                 || section.name.replace(' ', "_") == chip
                 || (chip == "probe" && is_probe(kind))
         })
-    }
-
-    /// `tmc2209_stepper_x:virtual_endstop` needs a pin at which the driver says that the motor stalls.
-    fn driver_has_diag(&self, section: &Section, setting: &Setting, pin: &Pin) -> Result<(), Trouble> {
-        let Some((kind, stepper)) = pin.chip.split_once('_').filter(|(kind, _)| kind.starts_with("tmc")) else {
-            return Ok(());
-        };
-        let driver = self.config.section(&format!("{kind} {stepper}"));
-        let keys = ["diag_pin", "diag0_pin", "diag1_pin"];
-        if driver.is_some_and(|driver| !keys.iter().any(|key| driver.text(key).is_some())) {
-            let cause = "tmc virtual endstop requires diag pin config";
-            return Err(section.trouble(&setting.key, cause).remedy("add the driver's diag pin"));
-        }
-        if pin.inverted || pin.pull != 0 {
-            let cause = "Can not pullup/invert tmc virtual pin";
-            return Err(section.trouble(&setting.key, cause).remedy("write it without ^ and !"));
-        }
-        Ok(())
     }
 }

@@ -44,6 +44,10 @@ pub(super) struct Description {
     names: HashSet<(String, String)>,
     /// By their data lines, or by their names.
     buses: BTreeMap<String, String>,
+    /// The addresses on I2C buses that have a chip.
+    chips: HashSet<(String, i64)>,
+    /// The motors that have a driver.
+    driven: HashSet<String>,
 }
 
 impl Description {
@@ -79,6 +83,16 @@ impl Description {
         self.buses.insert(format!("{kind} {key}"), name.clone());
         self.add(kind, entry);
         name
+    }
+
+    /// Whether no other section has the chip at this address. Two may read one chip.
+    pub(super) fn is_new_chip(&mut self, bus: &str, address: i64) -> bool {
+        self.chips.insert((bus.to_owned(), address))
+    }
+
+    /// Whether no other section has the driver of this motor.
+    pub(super) fn is_new_driver(&mut self, axis: &str) -> bool {
+        self.driven.insert(axis.to_owned())
     }
 
     pub(super) fn into_table(self) -> Table {

@@ -5,6 +5,7 @@ use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
 use super::known::is_left_over;
+use super::plugins::{PIN, StandIn};
 use super::translate::Translator;
 
 /// How high a coil is above the nozzle's tip.
@@ -54,11 +55,26 @@ impl Translator<'_> {
         for section in self.config.sections() {
             self.device(section)?;
         }
+        self.stand_in();
         Ok(())
+    }
+
+    /// The plain probe in the place of a plugin's.
+    fn stand_in(&mut self) {
+        let Some(StandIn { section, offsets_mm }) = self.left_out.stand_in.clone() else { return };
+        let mut part = Entry::default().set("kind", "probe").set("pin", PIN);
+        for (axis, mm) in ["x", "y", "z"].iter().zip(offsets_mm) {
+            part = part.set(&format!("{axis}_offset_mm"), mm);
+        }
+        self.out.add("part", part);
+        if let Some(section) = self.config.section(&section) {
+            self.note(section, "is left out", "a plain [probe] at its offsets takes its place");
+        }
     }
 
     fn device(&mut self, section: &Section) -> Result<(), Trouble> {
         match section.kind() {
+            _ if self.left_out.stand_in.is_some() && section.kind() == "probe" => Ok(()),
             "probe" if is_left_over(self.config, section) => Ok(()),
             "probe" | "smart_effector" => self.probe(section),
             "bltouch" => self.bltouch(section),
@@ -123,6 +139,9 @@ impl Translator<'_> {
     fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
         let bus = self.i2c(section)?;
         let address = section.whole("i2c_address", 0)?.unwrap_or(42);
+        if !self.out.is_new_chip(&bus, address) {
+            return Ok(());
+        }
         let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
         for axis in ["x", "y"] {
             let mm = section.number(&format!("{axis}_offset"), Limit::Any)?.unwrap_or(0.0);
@@ -165,7 +184,11 @@ impl Translator<'_> {
                 let part = Entry::default().set("kind", "ads1220").set("bus", bus).set_if("select_pin", select);
                 part.set("drdy_pin", ready)
             }
-            _ => return Ok(()),
+            chip => {
+                let cause = format!("has the chip {chip}, which is not simulated");
+                self.note(section, &cause, "its pins exist, and nothing is at them");
+                return Ok(());
+            }
         };
         self.out.add("part", part.set("cell", cell));
         Ok(())
@@ -229,6 +252,12 @@ impl Translator<'_> {
             let Some(pin) = self.take(section, "pin")? else { continue };
             let name = self.name_of("part", section);
             let order = section.list("color_order", ',').first().map_or("GRB".to_owned(), |order| order.to_uppercase());
+            let mut letters: Vec<char> = order.chars().collect();
+            letters.sort_unstable();
+            if !["BGR", "BGRW"].contains(&letters.iter().collect::<String>().as_str()) {
+                let cause = format!("Invalid color_order '{order}'");
+                return Err(section.trouble("color_order", cause).remedy("write it as GRB"));
+            }
             let count = section.whole("chain_count", 1)?.unwrap_or(1);
             self.out.add("spi_bus", Entry::default().set("name", pin.as_str()));
             let part = Entry::default().set("kind", "ws2812").set("name", name).set("count", count);
@@ -272,15 +301,18 @@ impl Translator<'_> {
         }
         if section.text("cs_pin").is_none() {
             let bus = self.i2c(section)?;
-            let name = self.name_of("part", section);
             let address = section.whole("i2c_address", 0)?.unwrap_or(60);
-            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            if !self.out.is_new_chip(&bus, address) {
+                return Ok(());
+            }
+            let name = self.name_of("part", section);
+            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
             let part = part.set("address", address).set_if("reset_pin", self.take(section, "reset_pin")?);
             self.out.add("part", part);
         } else {
             let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
             let name = self.name_of("part", section);
-            let part = Entry::default().set("kind", "ssd1306").set("name", name).set("bus", bus);
+            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
             let part = part.set_if("select_pin", select).set_if("dc_pin", self.take(section, "dc_pin")?);
             let part = part.set_if("reset_pin", self.take(section, "reset_pin")?);
             self.out.add("part", part);
@@ -340,7 +372,11 @@ impl Translator<'_> {
         part = match usual.filter(|_| !is_on_spi) {
             Some(usual) => {
                 let bus = self.i2c(section)?;
-                part.set("bus", bus).set("address", section.whole("i2c_address", 0)?.unwrap_or(usual))
+                let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
+                if !self.out.is_new_chip(&bus, address) {
+                    return Ok(());
+                }
+                part.set("bus", bus).set("address", address)
             }
             None => {
                 section.required("cs_pin")?;
@@ -383,6 +419,9 @@ impl Translator<'_> {
         };
         let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
         let bus = self.i2c(section)?;
+        if !self.out.is_new_chip(&bus, address) {
+            return Ok(());
+        }
         let name = self.name_of("part", section);
         let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
         self.out.add("part", part.set("address", address));

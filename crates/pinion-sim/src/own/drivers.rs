@@ -8,6 +8,9 @@ use super::description::Entry;
 use super::known::motor_of;
 use super::translate::Translator;
 
+/// Highest address of a driver on a UART.
+const ADDRESS_MAX: i64 = 3;
+
 impl Translator<'_> {
     pub(super) fn drivers(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections() {
@@ -33,7 +36,7 @@ impl Translator<'_> {
     }
 
     fn by_spi(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
-        let Some(axis) = self.driven(section) else { return Ok(()) };
+        let Some(axis) = self.driven(section).filter(|axis| self.out.is_new_driver(axis)) else { return Ok(()) };
         section.required("cs_pin")?;
         let chain = section.whole("chain_length", 2)?;
         // klippy opens the bus of a chain for the first of its drivers.
@@ -72,7 +75,7 @@ impl Translator<'_> {
     }
 
     fn by_uart(&mut self, section: &Section, kind: &str) -> Result<(), Trouble> {
-        let Some(axis) = self.driven(section) else { return Ok(()) };
+        let Some(axis) = self.driven(section).filter(|axis| self.out.is_new_driver(axis)) else { return Ok(()) };
         section.required("uart_pin")?;
         let Some(pin) = self.pin(section, "uart_pin")?.filter(|pin| self.is_real(pin)) else { return Ok(()) };
         self.take_pin(section, &pin);
@@ -94,7 +97,12 @@ impl Translator<'_> {
             part = part.set("tx_pin", tx.to_string());
         }
         if kind != "tmc2208" {
-            part = part.set("address", section.whole("uart_address", 0)?.unwrap_or(0));
+            let address = section.whole("uart_address", 0)?.unwrap_or(0);
+            if address > ADDRESS_MAX {
+                let cause = format!("Option 'uart_address' in section '{}' must have maximum of 3", section.name);
+                return Err(section.trouble("uart_address", cause).remedy("correct its value"));
+            }
+            part = part.set("address", address);
         }
         if kind == "tmc2240" {
             part = self.with_stall_guard(section, part)?;

@@ -4,13 +4,18 @@
 use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
-use super::sensors::{mcu_at_40, sensor};
+use super::sensors::{is_known, mcu_at_40, sensor};
 use super::translate::{Pace, Translator};
 
 /// Temperature of the surroundings.
 const AMBIENT_CELSIUS: f64 = 25.0;
 /// Full power could heat this much above the highest permitted temperature, as a share of it.
 const RESERVE: f64 = 1.3;
+/// The highest temperatures that full power reaches without [`RESERVE`], of a bed and of others. A `max_temp` above any
+/// real one only switches klippy's check off.
+const REAL_MAX_CELSIUS: [f64; 2] = [150.0, 500.0];
+/// No heater of a printer is as hot as this.
+const UNREAL_CELSIUS: f64 = 1000.0;
 /// Heat that a heater's mass stores. Only its ratio to the power counts.
 const J_PER_K: f64 = 15.0;
 /// klippy's PID parameters are for a power of 0 to this.
@@ -61,6 +66,13 @@ impl Translator<'_> {
         let pin = self.take(section, "heater_pin")?.or(nothing);
         let min = section.number("min_temp", Limit::Any)?.unwrap_or(0.0);
         let max = section.number("max_temp", Limit::Any)?.unwrap_or(100.0);
+        if max > UNREAL_CELSIUS {
+            self.note(
+                section,
+                &format!("has max_temp {max}, with which klippy checks nothing"),
+                "write the highest safe one",
+            );
+        }
         let start = AMBIENT_CELSIUS.clamp(min.min(max), max.max(min));
         let mut entry = Entry::default().set("name", name.as_str()).set("min_celsius", min).set("max_celsius", max);
         if start != AMBIENT_CELSIUS {
@@ -70,7 +82,8 @@ impl Translator<'_> {
             Some(pin) => {
                 let rate = self.kelvin_per_second(section)?;
                 let watts = rate * J_PER_K;
-                let reach = (RESERVE * (max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, max)?);
+                let real_max = max.min(REAL_MAX_CELSIUS[usize::from(section.kind() != "heater_bed")]);
+                let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, real_max)?);
                 entry
                     .set("pin", pin.as_str())
                     .set("heater_watts", watts)
@@ -145,27 +158,28 @@ impl Translator<'_> {
                 let name = self.out.name("part", heater);
                 self.out.add("part", part.set("kind", "ds18b20").set("name", name).set("serial", serial));
             }
-            "BME280" | "HTU21D" | "SHT21" | "SI7013" | "SI7020" | "SI7021" | "SHT3X" | "AHT10" | "LM75" => {
+            "BME280" | "HTU21D" | "SHT21" | "SI7013" | "SI7020" | "SI7021" | "SHT3X" | "AHT10" | "AHT1X" | "AHT2X"
+            | "AHT3X" | "LM75" => {
                 let (chip, address) = match kind {
                     "BME280" => ("bme280", 118),
                     "SHT3X" => ("sht3x", 68),
-                    "AHT10" => ("aht10", 56),
+                    "AHT10" | "AHT1X" | "AHT2X" | "AHT3X" => ("aht10", 56),
                     "LM75" => ("lm75", 72),
                     _ => ("htu21d", 64),
                 };
                 let address = section.whole("i2c_address", 0)?.unwrap_or(address);
                 let bus = self.i2c(section)?;
+                if !self.out.is_new_chip(&bus, address) {
+                    return Ok(());
+                }
                 let name = self.out.name("part", heater);
                 let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
                 self.out.add("part", part.set("address", address));
             }
+            _ if is_known(self.config, kind) => {}
             _ => {
-                let known = self.config.sections().iter().any(|section| section.name == kind);
-                if !known {
-                    return Err(section
-                        .trouble("sensor_type", format!("Unknown temperature sensor '{kind}'"))
-                        .remedy("correct it, or add [thermistor] or [adc_temperature]"));
-                }
+                let cause = format!("has the sensor {kind} of a plugin, which is not simulated");
+                self.note(section, &cause, "klippy reads no temperature here");
             }
         }
         Ok(())

@@ -21,128 +21,13 @@ const NOT_SIMULATED: &[&str] =
     &["ads131m0x", "ads1x1x", "belay", "dockable_probe", "mcp4728", "palette2", "replicape", "trad_rack"];
 
 /// All others.
-const KNOWN: &[&str] = &[
-    "ad5206",
-    "adc_scaled",
-    "adc_temperature",
-    "ads1220",
-    "adxl345",
-    "aht10",
-    "angle",
-    "axis_twist_compensation",
-    "bed_mesh",
-    "bed_screws",
-    "bed_tilt",
-    "bltouch",
-    "bme280",
-    "bmi160",
-    "board_pins",
-    "bus",
-    "carriage",
-    "constants",
-    "controller_fan",
-    "dac084S085",
-    "danger_options",
-    "delayed_gcode",
-    "delta_calibrate",
-    "display",
-    "display_data",
-    "display_glyph",
-    "display_status",
-    "display_template",
-    "dotstar",
-    "ds18b20",
-    "dual_carriage",
-    "duplicate_pin_override",
-    "endstop_phase",
-    "exclude_object",
-    "extra_carriage",
-    "extruder_stepper",
-    "fan",
-    "fan_generic",
-    "filament_motion_sensor",
-    "filament_switch_sensor",
-    "firmware_retraction",
-    "force_move",
-    "gcode_arcs",
-    "gcode_button",
-    "gcode_macro",
-    "gcode_shell_command",
-    "hall_filament_width_sensor",
-    "hx71x",
-    "heated_fan",
-    "heater_bed",
-    "heater_fan",
-    "heater_generic",
-    "homing_heaters",
-    "homing_override",
-    "htu21d",
-    "icm20948",
-    "idle_timeout",
-    "include",
-    "input_shaper",
-    "led",
-    "lis2dw",
-    "lis3dh",
-    "lm75",
-    "load_cell",
-    "load_cell_probe",
-    "manual_probe",
-    "manual_stepper",
-    "mcp4018",
-    "mcp4451",
-    "mcu",
-    "menu",
-    "mpu9250",
-    "mixing_extruder",
-    "multi_pin",
-    "neopixel",
-    "nozzle_cleanup",
-    "output_pin",
-    "pause_resume",
-    "pca9533",
-    "pca9632",
-    "pid_profile",
-    "printer",
-    "probe",
-    "probe_eddy_current",
-    "pwm_cycle_time",
-    "pwm_tool",
-    "quad_gantry_level",
-    "resonance_tester",
-    "respond",
-    "safe_z_home",
-    "samd_sercom",
-    "save_variables",
-    "screws_tilt_adjust",
-    "sdcard_loop",
-    "servo",
-    "sht3x",
-    "skew_correction",
-    "smart_effector",
-    "static_digital_output",
-    "static_pwm_clock",
-    "stepper",
-    "sx1509",
-    "telemetry",
-    "temperature_combined",
-    "temperature_fan",
-    "temperature_host",
-    "temperature_probe",
-    "temperature_sensor",
-    "thermistor",
-    "tools_calibrate",
-    "tsl1401cl_filament_width_sensor",
-    "tuning_tower",
-    "verify_heater",
-    "virtual_sdcard",
-    "z_calibration",
-    "z_thermal_adjust",
-    "z_tilt",
-    "z_tilt_ng",
-];
+const KNOWN: &str = include_str!("sections.txt");
 
-fn is_numbered(word: &str, prefix: &str) -> bool {
+fn known() -> impl Iterator<Item = &'static str> {
+    KNOWN.lines().filter(|line| !line.starts_with('#')).flat_map(str::split_whitespace)
+}
+
+pub(super) fn is_numbered(word: &str, prefix: &str) -> bool {
     word.strip_prefix(prefix).is_some_and(|number| number.chars().all(|digit| digit.is_ascii_digit()))
 }
 
@@ -150,10 +35,34 @@ fn is_numbered(word: &str, prefix: &str) -> bool {
 pub(crate) fn kind_of(word: &str) -> Kind {
     match word {
         _ if NOT_SIMULATED.contains(&word) => Kind::NotSimulated,
-        _ if KNOWN.contains(&word) || word.starts_with("stepper_") || is_numbered(word, "extruder") => Kind::Known,
-        "tmc2130" | "tmc2208" | "tmc2209" | "tmc2240" | "tmc2660" | "tmc5160" => Kind::Known,
+        _ if known().any(|own| own == word) || word.starts_with("stepper_") || is_numbered(word, "extruder") => {
+            Kind::Known
+        }
         _ => Kind::Strange,
     }
+}
+
+/// The known section whose name a first word misspells, by one letter or two that are swapped.
+pub(super) fn near(word: &str) -> Option<&'static str> {
+    // A short word of a plugin is near to many others.
+    const LETTERS_MIN: usize = 5;
+    known().find(|known| word.len() >= LETTERS_MIN && is_near(word, known))
+}
+
+/// Whether one edit makes one word of the other: a letter more, less or another one, or two that are swapped.
+fn is_near(one: &str, other: &str) -> bool {
+    let (mut one, mut other): (Vec<char>, Vec<char>) = (one.chars().collect(), other.chars().collect());
+    for _ in 0..2 {
+        // The common end goes, then the common beginning.
+        while one.last().is_some_and(|last| other.last() == Some(last)) {
+            one.pop();
+            other.pop();
+        }
+        one.reverse();
+        other.reverse();
+    }
+    let is_swapped = one.len() == 2 && other.len() == 2 && one[0] == other[1] && one[1] == other[0];
+    one != other && (one.len().max(other.len()) == 1 || is_swapped)
 }
 
 /// Sections of klippy without a module of their own.
@@ -221,5 +130,30 @@ mod tests {
             assert!(lacks(word), "{word}");
         }
         assert!(lacks_module("shaketune", None) && !lacks_module("gcode_shell_command", None));
+    }
+
+    #[test]
+    fn a_misspelled_section_is_near_to_one() {
+        for (word, meant) in [
+            ("heater_fann", Some("heater_fan")),
+            ("haeter_bed", Some("heater_bed")),
+            ("bed_mash", Some("bed_mesh")),
+            ("gcode_macr", Some("gcode_macro")),
+            ("mmu", None),
+            ("beacon", None),
+            ("led_effect", None),
+        ] {
+            assert_eq!(near(word), meant, "{word}");
+        }
+    }
+
+    #[test]
+    fn klippers_own_sections_are_known() {
+        for word in
+            ["query_adc", "pid_calibrate", "print_stats", "gcode_move", "heaters", "buttons", "statistics", "indx"]
+        {
+            assert_eq!(kind_of(word), Kind::Known, "{word}");
+        }
+        assert_eq!([kind_of("ads1x1x"), kind_of("shaketune")], [Kind::NotSimulated, Kind::Strange]);
     }
 }

@@ -3,18 +3,21 @@
 //!
 //! - `translate`: sections become a description, as a table of TOML; `motion`, `heat`, `devices` are its parts
 //! - `sensors`: the tables of thermistors and amplifiers
-//! - `known`: the sections of Klipper and Kalico
-//! - `rules`: the options that klippy needs, and their ranges; `claims`: each pin has one owner
+//! - `klippy`: klippy's own verdict; without a klippy, `rules` and `claims` find the most frequent mistakes
+//! - `known`: the sections of Klipper and Kalico; `plugins`: those that the copy is without
 //! - `serve`: the folder with the copy that klippy gets
 
 pub(crate) mod args;
+mod chips;
 mod claims;
 mod description;
 mod devices;
 mod drivers;
 mod heat;
+mod klippy;
 mod known;
 mod motion;
+mod plugins;
 mod rules;
 pub(crate) mod run;
 mod sensors;

@@ -43,21 +43,60 @@ enum Endstop {
     Other,
 }
 
+/// The kinematics of Klipper and Kalico. Of names within each other, the longer one comes first.
+const KINEMATICS: [&str; 15] = [
+    "limited_cartesian",
+    "limited_corexy",
+    "limited_corexz",
+    "hybrid_corexy",
+    "hybrid_corexz",
+    "generic_cartesian",
+    "rotary_delta",
+    "cartesian",
+    "corexy",
+    "corexz",
+    "deltesian",
+    "delta",
+    "polar",
+    "winch",
+    "none",
+];
+
+/// Whether klippy has these kinematics.
+pub(super) fn is_known(kinematics: &str) -> bool {
+    KINEMATICS.contains(&kinematics)
+}
+
+/// The kinematics that stand for these: their own, or those that the name of a plugin's ends with.
+fn simulated(kinematics: &str) -> Option<&'static str> {
+    KINEMATICS
+        .into_iter()
+        .find(|known| kinematics == *known || kinematics.strip_suffix(known).is_some_and(|rest| rest.ends_with('_')))
+}
+
 impl<'a> Translator<'a> {
     pub(super) fn motion(&mut self) -> Result<(), Trouble> {
         let Some(printer) = self.config.section("printer") else {
             let cause = "Option 'kinematics' in section 'printer' must be specified";
             return Err(Trouble::new(cause).remedy("add [printer]"));
         };
-        let kind = printer.required("kinematics")?.to_owned();
-        match kind.as_str() {
+        let named = printer.required("kinematics")?;
+        let Some(kind) = simulated(named) else {
+            let cause = format!("Error loading kinematics '{named}'");
+            return Err(printer.trouble("kinematics", cause).remedy("name one of Klipper's kinematics"));
+        };
+        if kind != named {
+            let cause = format!("has the kinematics {named} of a plugin, which are simulated as {kind}");
+            self.note(printer, &cause, "compare what it shows with your printer");
+        }
+        match kind {
             "cartesian" | "corexy" | "corexz" | "hybrid_corexy" | "hybrid_corexz" | "limited_cartesian"
             | "limited_corexy" | "limited_corexz" => {
                 for axis in ["x", "y", "z"] {
                     self.rail(axis)?;
                 }
                 self.dual_carriage()?;
-                let kind = kind.strip_prefix("limited_").unwrap_or(&kind);
+                let kind = kind.strip_prefix("limited_").unwrap_or(kind);
                 self.out.set("kinematics", Entry::default().set("kind", kind));
             }
             "generic_cartesian" => self.generic()?,
@@ -66,11 +105,7 @@ impl<'a> Translator<'a> {
             "polar" => self.polar()?,
             "rotary_delta" => self.rotary_delta(printer)?,
             "winch" => self.winch()?,
-            "none" => self.out.set("kinematics", Entry::default().set("kind", "none")),
-            _ => {
-                let cause = format!("Error loading kinematics '{kind}'");
-                return Err(printer.trouble("kinematics", cause).remedy("name one of Klipper's kinematics"));
-            }
+            _ => self.out.set("kinematics", Entry::default().set("kind", "none")),
         }
         self.other_motors()
     }
@@ -445,6 +480,11 @@ impl<'a> Translator<'a> {
             let is_extruder = kind.strip_prefix("extruder").is_some_and(|n| n.chars().all(|c| c.is_ascii_digit()));
             if is_extruder || kind == "extruder_stepper" || kind == "manual_stepper" {
                 if is_extruder && section.text("step_pin").is_none() {
+                    continue;
+                }
+                // Two sections may drive one motor.
+                if let Some(axis) = self.owner(section, "step_pin")?.and_then(|owner| self.axes.get(owner)).cloned() {
+                    self.axes.insert(section.name.clone(), axis);
                     continue;
                 }
                 let name = self.out.name("axis", section.own_name().unwrap_or(&section.name));

@@ -13,8 +13,9 @@ use pinion_printer_config::Trouble;
 use toml::Table;
 
 use super::args::OwnArgs;
-use super::known::lacks_module;
-use super::serve::{Folder, Own, section_of};
+use super::klippy::Klippy;
+use super::serve::{Folder, Own, Reading, section_of};
+use super::translate::check;
 use crate::description::text;
 
 /// Whether a file is klippy's configuration, and no description.
@@ -29,7 +30,22 @@ pub(crate) fn is_printer_cfg(path: &Path) -> bool {
 /// It is no printer, or has a mistake.
 pub(crate) fn read(path: &Path, args: &OwnArgs) -> Result<Own, Trouble> {
     let over = args.with.as_deref().map(table).transpose()?;
-    let own = Own::read(path, args.built_like.as_deref(), over, args.pace())?;
+    let klippy = Klippy::of(args);
+    let klipper = args.klipper();
+    let reading = Reading {
+        built_like: args.built_like.as_deref(),
+        over,
+        pace: args.pace(),
+        without_plugins: args.without_plugins,
+        klipper: klipper.as_deref(),
+        is_checked: klippy.is_none(),
+    };
+    let own = Own::read(path, reading)?;
+    if let Some(klippy) = klippy
+        && !klippy.judge(&own)?
+    {
+        check(&own.config)?;
+    }
     own.notes.iter().for_each(|note| log::warn!("{note}"));
     Ok(own)
 }
@@ -63,15 +79,10 @@ impl Place {
             let trouble = Trouble::new("there is no klippy/klippy.py in it").of(klipper.display());
             return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper"));
         }
-        let sections = own.config.sections().iter();
-        let left_out: Vec<&str> = sections
-            .filter(|section| args.without_plugins && lacks_module(section.kind(), args.klipper().as_deref()))
-            .map(|section| section.name.as_str())
-            .collect();
-        if !left_out.is_empty() {
-            log::info!("klippy's copy is without [{}]", left_out.join("], ["));
+        if !own.left_out.sections.is_empty() {
+            log::info!("klippy's copy is without [{}]", own.left_out.sections.join("], ["));
         }
-        Folder::make(own, &left_out, args.folder.as_deref(), link).map(Place::Folder)
+        Folder::make(own, args.folder.as_deref(), link).map(Place::Folder)
     }
 
     /// The links of all MCUs, the main one's first.

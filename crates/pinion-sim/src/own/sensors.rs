@@ -20,6 +20,8 @@ const THERMISTORS: &[(&str, &Points, Option<f64>)] = &[
     ("SliceEngineering 450", &[(25.0, 500_000.0), (200.0, 3734.0), (400.0, 240.0)], None),
     ("TDK NTCG104LH104JT1", &[(25.0, 100_000.0), (50.0, 31_230.0), (125.0, 2066.0)], None),
     ("Honeywell 100K 135-104LAG-J01", &[(25.0, 100_000.0)], Some(3974.0)),
+    // klippy had it until v0.12.
+    ("NTC 100K beta 3950", &[(25.0, 100_000.0)], Some(3950.0)),
     ("NTC 100K MGB18-104F39050L32", &[(25.0, 100_000.0)], Some(4100.0)),
 ];
 
@@ -126,6 +128,42 @@ const AMPLIFIERS: &[(&str, &Points)] = &[
         ],
     ),
 ];
+
+/// The sensors that are chips of their own.
+pub(super) const CHIPS: [&str; 19] = [
+    "MAX6675",
+    "MAX31855",
+    "MAX31856",
+    "MAX31865",
+    "DS18B20",
+    "BME280",
+    "HTU21D",
+    "SHT21",
+    "SI7013",
+    "SI7020",
+    "SI7021",
+    "SHT3X",
+    "AHT10",
+    "AHT1X",
+    "AHT2X",
+    "AHT3X",
+    "LM75",
+    "temperature_mcu",
+    "temperature_host",
+];
+
+/// Whether a sensor is one that Klipper or Kalico has, or that the configuration describes.
+pub(super) fn is_known(config: &Config, name: &str) -> bool {
+    let described =
+        ["thermistor", "adc_temperature"].iter().any(|kind| config.section(&format!("{kind} {name}")).is_some());
+    let others = ["PT1000", "PT100 INA826", "temperature_combined", "mpc_block_temperature", "mpc_ambient_temperature"];
+    described
+        || THERMISTORS.iter().any(|(known, ..)| *known == name)
+        || AMPLIFIERS.iter().any(|(known, _)| *known == name)
+        || CHIPS.contains(&name)
+        || others.contains(&name)
+        || config.section(name).is_some()
+}
 
 /// 0 °C in kelvin.
 const KELVIN: f64 = 273.15;

@@ -13,10 +13,12 @@ use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::copy::{self, Change};
 use pinion_printer_config::pins::MAIN;
 use pinion_printer_config::{Config, Section, Trouble};
+use pinion_runtime::klippy::is_host_path;
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
-use super::translate::{Pace, Pins, Translated, translate};
+use super::plugins::{LeftOut, StandIn};
+use super::translate::{Pace, Pins, Translated, check, translate};
 use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
@@ -35,46 +37,64 @@ pub(crate) struct Own {
     /// The MCUs, the main one first.
     pub(crate) mcus: Vec<String>,
     pub(crate) notes: Vec<Trouble>,
+    /// What klippy's copy is without.
+    pub(super) left_out: LeftOut,
+}
+
+/// How a printer.cfg is read.
+pub(super) struct Reading<'a> {
+    /// The printer.cfg of the printer, if it is another one.
+    pub(super) built_like: Option<&'a Path>,
+    /// A description that lies over the one that comes out of it.
+    pub(super) over: Option<Table>,
+    pub(super) pace: Pace,
+    /// Whether the sections of plugins are left out.
+    pub(super) without_plugins: bool,
+    /// The checkout of the klippy, if it is known.
+    pub(super) klipper: Option<&'a Path>,
+    /// Whether no klippy is asked later.
+    pub(super) is_checked: bool,
 }
 
 impl Own {
-    /// Reads a printer.cfg. `built_like` is the printer.cfg of the printer, if it is another one. `over` is a description
-    /// that lies over the one that comes out of it.
+    /// Reads a printer.cfg.
     ///
     /// # Errors
     ///
     /// It is no printer, or has a mistake.
-    pub(crate) fn read(
-        path: &Path,
-        built_like: Option<&Path>,
-        over: Option<Table>,
-        pace: Pace,
-    ) -> Result<Own, Trouble> {
-        let (config, translated) = read(path, pace)?;
+    pub(super) fn read(path: &Path, reading: Reading<'_>) -> Result<Own, Trouble> {
+        let (config, left_out, translated) = read(path, &reading)?;
         let Translated { mut description, mcus, pins, notes } = translated;
-        if let Some(built_like) = built_like {
-            let (_, built) = read(built_like, pace)?;
+        if let Some(built_like) = reading.built_like {
+            let (_, _, built) = read(built_like, &reading)?;
             if built.mcus != mcus {
                 let cause = format!("it has the MCUs {}, and {} has others", built.mcus.join(", "), path.display());
                 return Err(Trouble::new(cause).of(built_like.display()).remedy("name a printer.cfg of this printer"));
             }
             description = with_places_of(built, &description, &pins);
         }
-        if let Some(over) = over {
+        if let Some(over) = reading.over {
             lay_over(&mut description, over);
         }
         let name = path.display();
         let description = toml::to_string(&description).map_err(|error| Trouble::new(error.to_string()).of(&name))?;
         let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
-        Ok(Own { config, sim, description, mcus, notes })
+        Ok(Own { config, sim, description, mcus, notes, left_out })
     }
 }
 
-fn read(path: &Path, pace: Pace) -> Result<(Config, Translated), Trouble> {
+fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translated), Trouble> {
     let mut config = Config::read(path)?;
     config.put_constants_in();
-    let translated = translate(&config, pace)?;
-    Ok((config, translated))
+    if reading.is_checked {
+        check(&config)?;
+    }
+    let left_out = match reading.without_plugins {
+        true => LeftOut::of(&config, reading.klipper)?,
+        false => LeftOut::default(),
+    };
+    let translated = translate(&config, reading.pace, &left_out)?;
+    Ok((config, left_out, translated))
 }
 
 /// The printer with the pins and buses that another configuration names, too. Nothing is at them.
@@ -150,18 +170,12 @@ pub(crate) fn section_of(mcu: &str) -> String {
 }
 
 impl Folder {
-    /// Makes the folder and the copy, without the sections `left_out`. `link` is the main MCU's link, if it is not in the
-    /// folder.
+    /// Makes the folder and the copy. `link` is the main MCU's link, if it is not in the folder.
     ///
     /// # Errors
     ///
     /// It cannot be written, or has files of somebody else.
-    pub(super) fn make(
-        own: &Own,
-        left_out: &[&str],
-        named: Option<&Path>,
-        link: Option<&Path>,
-    ) -> Result<Folder, Trouble> {
+    pub(super) fn make(own: &Own, named: Option<&Path>, link: Option<&Path>) -> Result<Folder, Trouble> {
         let path = match named {
             Some(named) => new_or_ours(named)?,
             None => nix::unistd::mkdtemp("/tmp/pinion-sim-XXXXXX").map_err(|error| {
@@ -176,11 +190,14 @@ impl Folder {
         fs::write(path.join(MARK), "").map_err(|error| failed(&path, error))?;
         let main = link.map_or_else(|| path.join(MAIN), Path::to_owned);
         let links = links_of(&main, own.mcus.iter().map(String::as_str));
-        let served = |(mcu, link): (&String, &PathBuf)| Change {
-            section: section_of(mcu),
-            without: WAYS.map(str::to_owned).to_vec(),
-            with: vec![("serial".into(), link.display().to_string()), ("restart_method".into(), "command".into())],
-            ..Change::default()
+        let served = |(mcu, link): (&String, &PathBuf)| {
+            let mut with = vec![("serial".into(), link.display().to_string())];
+            // klippy knows no other method at such a path, and no option for it.
+            if !is_host_path(link) {
+                with.push(("restart_method".into(), "command".into()));
+            }
+            let without = WAYS.map(str::to_owned).to_vec();
+            Change { section: section_of(mcu), without, with, ..Change::default() }
         };
         let mut changes: Vec<Change> = own.mcus.iter().zip(&links).map(served).collect();
         let elsewhere = |section: &str, key: &str, value: &Path| Change {
@@ -189,7 +206,10 @@ impl Folder {
             with: vec![(key.into(), value.display().to_string())],
             ..Change::default()
         };
-        changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        // Without the option, klippy refuses the section, and so it does the copy.
+        if own.config.section("virtual_sdcard").is_some_and(|section| section.text("path").is_some()) {
+            changes.push(elsewhere("virtual_sdcard", "path", &gcodes));
+        }
         let is_of_host = |section: &&Section| section.text("sensor_type") == Some("temperature_host");
         let of_host: Vec<&Section> = own.config.sections().iter().filter(is_of_host).collect();
         if !of_host.is_empty() {
@@ -198,7 +218,8 @@ impl Folder {
             fs::write(&millidegrees, HOST_TEMPERATURE).map_err(|error| failed(&millidegrees, error))?;
             changes.extend(of_host.iter().map(|section| elsewhere(&section.name, "sensor_path", &millidegrees)));
         }
-        if let Some(section) = own.config.section("save_variables") {
+        if let Some(section) = own.config.section("save_variables").filter(|section| section.text("filename").is_some())
+        {
             let variables = path.join("variables.cfg");
             let file = section.text("filename").map(at_home);
             if let Some(file) = file
@@ -208,13 +229,21 @@ impl Folder {
             }
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
+        // That phase is the real endstop's. The simulated one has another.
+        let phases = own.config.of_kind("endstop_phase").map(|section| Change {
+            section: section.name.clone(),
+            without: vec!["trigger_phase".into()],
+            ..Change::default()
+        });
+        changes.extend(phases);
+        let LeftOut { sections: left_out, stand_in } = own.left_out.clone();
         changes.extend(left_out.iter().map(|section| Change {
-            section: (*section).to_owned(),
+            section: section.clone(),
             left_out: true,
+            instead: stand_in.as_ref().filter(|stand_in| stand_in.section == *section).map(StandIn::text),
             ..Change::default()
         }));
         let printer_cfg = copy::write(&own.config, &changes, &path)?;
-        let left_out = left_out.iter().map(|section| (*section).to_owned()).collect();
         Ok(Folder { path, printer_cfg, links, left_out })
     }
 

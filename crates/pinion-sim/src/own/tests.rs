@@ -7,6 +7,8 @@ use pinion_printer_config::Config;
 use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
+use super::plugins::LeftOut;
+use super::translate::check;
 use super::{Pace, Translated, translate};
 
 const PRINTER: &str = include_str!("../../../../tests/kit/two-boards.cfg");
@@ -17,7 +19,109 @@ fn translated(text: &str) -> Result<Translated, String> {
     fs::write(&path, text).unwrap();
     let config = Config::read(&path).unwrap();
     let folder = format!("{}/", folder.path().display());
-    translate(&config, Pace::Fast).map_err(|trouble| trouble.to_string().replace(&folder, ""))
+    translate(&config, Pace::Fast, &LeftOut::default()).map_err(|trouble| trouble.to_string().replace(&folder, ""))
+}
+
+/// The same without a klippy, and as a whole description. Returns the notes.
+fn served(more: &str) -> Result<Vec<String>, String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("printer.cfg");
+    fs::write(&path, format!("{PRINTER}\n{more}")).unwrap();
+    let config = Config::read(&path).unwrap();
+    check(&config).map_err(|trouble| trouble.to_string())?;
+    let Translated { description, notes, .. } = translated(&format!("{PRINTER}\n{more}"))?;
+    SimConfig::parse(&toml::to_string(&description).unwrap(), "this test").map_err(|trouble| trouble.to_string())?;
+    Ok(notes.iter().map(ToString::to_string).collect())
+}
+
+/// Each of these works on a real printer, with one of the hosts.
+#[test]
+fn what_some_klippy_takes_is_no_mistake() {
+    let chip = |name: &str| format!("[temperature_sensor {name}]\nsensor_type: BME280\ni2c_bus: i2c1\n");
+    let alone = |name: &str, bus: &str| {
+        format!("[temperature_sensor {name}]\nsensor_type: MAX31855\nsensor_pin: tool:None\nspi_bus: spi{bus}\n")
+    };
+    for (name, more) in [
+        ("AHT", ["AHT1X", "AHT2X", "AHT3X"].map(|kind| format!("[temperature_sensor {kind}]\nsensor_type: {kind}\ni2c_bus: {kind}\n")).concat()),
+        ("beta", "[temperature_sensor a]\nsensor_type: NTC 100K beta 3950\nsensor_pin: PA2\n".into()),
+        ("mcp4018", "[mcp4018 a]\nscl_pin: PD5\nsda_pin: PD6\nwiper: 1\n[mcp4018 b]\nscl_pin: PD5\nsda_pin: PD7\nwiper: 1\n".into()),
+        ("timeout", "[idle_timeout]\ntimeout: 0\n".into()),
+        ("None", [alone("a", "1"), alone("b", "2")].concat()),
+        ("one chip", [chip("a"), chip("b")].concat()),
+        ("one motor", "[duplicate_pin_override]\npins: PB9, PC2\n[manual_stepper a]\nstep_pin: PB9\ndir_pin: !PC2\nmicrosteps: 16\nrotation_distance: 40\n".into()),
+        ("own sections", "[query_adc]\n[pid_calibrate]\n[print_stats]\n[gcode_move]\n[heaters]\n[buttons]\n[statistics]\n[indx]\n".into()),
+    ] {
+        let notes = served(&more).unwrap_or_else(|why| panic!("{name}: {why}"));
+        assert_eq!(notes, [""; 0], "{name}");
+    }
+    for (more, note) in [
+        (
+            "[load_cell]\nsensor_type: ads131m02\ncs_pin: PA4\n",
+            "[load_cell] has the chip ads131m02, which is not simulated",
+        ),
+        (
+            "[tca9548a a]\n[temperature_sensor b]\nsensor_type: AHT2X_TCA\n",
+            "[temperature_sensor b] has the sensor AHT2X_TCA of a plugin",
+        ),
+    ] {
+        let notes = served(more).unwrap();
+        assert!(notes.iter().any(|found| found.contains(note)), "{notes:?}");
+    }
+}
+
+#[test]
+fn kinematics_of_a_plugin_are_those_that_their_name_ends_with() {
+    let with = |kinematics: &str| PRINTER.replace("kinematics: cartesian", &format!("kinematics: {kinematics}"));
+    let kind = |kinematics: &str| {
+        let found = translated(&with(kinematics))?;
+        Ok::<_, String>((found.description["kinematics"]["kind"].as_str().unwrap().to_owned(), found.notes.len()))
+    };
+    assert_eq!(kind("ratos_hybrid_corexy"), Ok(("hybrid_corexy".into(), 1)));
+    assert_eq!(kind("my_corexy"), Ok(("corexy".into(), 1)));
+    assert_eq!(kind("limited_corexy"), Ok(("corexy".into(), 0)));
+    assert!(kind("cube").unwrap_err().contains("Error loading kinematics 'cube'"));
+}
+
+#[test]
+fn a_wrong_chip_is_found_beside_a_plugin() {
+    let refused = served("[shaketune]\n[output_pin x]\npin: nozle:PA1\n").unwrap_err();
+    assert!(refused.contains("Unknown pin chip name 'nozle'"), "{refused}");
+    served("[beacon]\nserial: x\n[output_pin x]\npin: beacon:PA1\n").unwrap();
+}
+
+#[test]
+fn a_display_has_its_own_controller() {
+    for chip in ["ssd1306", "sh1106"] {
+        let text = format!("{PRINTER}\n[display]\nlcd_type: {chip}\ni2c_bus: i2c1\n");
+        let Translated { description, .. } = translated(&text).unwrap();
+        assert_eq!(named(&description, "part", "kind", "ssd1306")["chip"].as_str(), Some(chip));
+    }
+}
+
+#[test]
+fn a_pin_that_no_chip_has_is_a_mistake() {
+    for (from, to) in [("step_pin: PB9", "step_pin: PB130"), ("pin: PA7", "pin: PX3")] {
+        let refused = translated(&PRINTER.replacen(from, to, 1)).unwrap_err();
+        let pin = to.split(' ').nth(1).unwrap();
+        assert!(
+            refused.contains(&format!("Pin '{pin}' is not a valid pin name on mcu 'mcu': correct it")),
+            "{refused}"
+        );
+    }
+}
+
+#[test]
+fn a_max_temp_that_is_no_limit_insulates_nothing() {
+    let loss = |max: &str| {
+        let text = PRINTER.replace("max_temp: 110", &format!("max_temp: {max}"));
+        let Translated { description, .. } = translated(&text).unwrap();
+        let bed = named(&description, "heater", "name", "heater_bed");
+        bed["loss_w_per_k"].as_float().unwrap() / bed["heater_watts"].as_float().unwrap()
+    };
+    let text = PRINTER.replace("max_temp: 250", "max_temp: 2600");
+    let notes = translated(&text).unwrap().notes;
+    assert!(notes.len() == 1 && notes[0].to_string().contains("[extruder] has max_temp 2600"), "{notes:?}");
+    assert!(loss("9999") > loss("110") / 2.0, "{} {}", loss("9999"), loss("110"));
 }
 
 fn tables<'a>(description: &'a Table, kind: &str) -> Vec<&'a Table> {

@@ -11,10 +11,13 @@ use pinion_printer_config::{Config, Section, Trouble};
 use pinion_sim::MCUS_MAX;
 use toml::Table;
 
+use super::chips;
 use super::claims;
 use super::description::{Description, Entry};
 use super::known::{Kind, kind_of};
+use super::plugins::LeftOut;
 use super::rules;
+use super::serve::section_of;
 
 /// How fast the heaters are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,17 +44,26 @@ pub(crate) struct Translated {
     pub(crate) notes: Vec<Trouble>,
 }
 
-/// Translates a configuration.
+/// Checks a configuration where no klippy can be asked.
+///
+/// # Errors
+///
+/// The first mistake that klippy refuses, too.
+pub(super) fn check(config: &Config) -> Result<(), Trouble> {
+    rules::check(config)?;
+    claims::check(config, &Aliases::read(config)?, &mcus(config)?)
+}
+
+/// Translates a configuration. The printer has all of it, but for a plain probe in the place of a plugin's.
 ///
 /// # Errors
 ///
 /// The first thing that klippy refuses, too, and without which there is no printer.
-pub(crate) fn translate(config: &Config, pace: Pace) -> Result<Translated, Trouble> {
+pub(super) fn translate(config: &Config, pace: Pace, left_out: &LeftOut) -> Result<Translated, Trouble> {
     let (aliases, mcus) = (Aliases::read(config)?, mcus(config)?);
-    rules::check(config)?;
-    claims::check(config, &aliases, &mcus)?;
     let mut translator = Translator {
         config,
+        left_out,
         aliases,
         mcus,
         taken: HashMap::new(),
@@ -79,6 +91,10 @@ fn mcus(config: &Config) -> Result<Vec<String>, Trouble> {
     if config.section(MAIN).is_none() {
         return Err(Trouble::new("Option 'serial' in section 'mcu' must be specified").remedy("add [mcu]"));
     }
+    // klippy's copy has other ways to the MCUs, so klippy does not miss these.
+    for section in config.of_kind(MAIN).filter(|section| section.text("canbus_uuid").is_none()) {
+        section.required("serial")?;
+    }
     let others = config.of_kind(MAIN).filter_map(Section::own_name).map(str::to_owned);
     let mcus: Vec<String> = std::iter::once(MAIN.to_owned()).chain(others).collect();
     if mcus.len() > MCUS_MAX {
@@ -90,6 +106,7 @@ fn mcus(config: &Config) -> Result<Vec<String>, Trouble> {
 
 pub(super) struct Translator<'a> {
     pub(super) config: &'a Config,
+    pub(super) left_out: &'a LeftOut,
     aliases: Aliases,
     pub(super) mcus: Vec<String>,
     /// The pins with something at them, and the section with that thing.
@@ -132,7 +149,14 @@ impl Translator<'_> {
             let reference = self.pin(scaled, "vref_pin")?;
             return Ok(self.aliases.resolve(&Pin { chip: reference.map_or(MAIN.into(), |pin| pin.chip), ..pin }));
         }
-        Ok(self.aliases.resolve(&pin))
+        let pin = self.aliases.resolve(&pin);
+        let mcu = self.config.section(&section_of(&pin.chip)).filter(|_| self.is_real(&pin));
+        // klippy does not see this: the simulated MCUs have each pin that the configuration names.
+        if let Some(names) = mcu.and_then(|mcu| chips::lacks(mcu.text("serial").unwrap_or_default(), &pin.name)) {
+            let cause = format!("Pin '{}' is not a valid pin name on mcu '{}'", pin.name, pin.chip);
+            return Err(section.trouble(key, cause).remedy(format!("correct it: this chip has at most {names}")));
+        }
+        Ok(pin)
     }
 
     /// Whether a pin is one of an MCU, and no virtual one.
@@ -157,6 +181,12 @@ impl Translator<'_> {
         }
         self.taken.insert(place, section.name.clone());
         Some(pin.to_string())
+    }
+
+    /// The section that has taken the pin of an option.
+    pub(super) fn owner(&self, section: &Section, key: &str) -> Result<Option<&str>, Trouble> {
+        let place = self.pin(section, key)?.map(|pin| (pin.chip, pin.name));
+        Ok(place.and_then(|place| self.taken.get(&place)).map(String::as_str))
     }
 
     /// Takes a pin that several motors may share.
@@ -201,8 +231,10 @@ impl Translator<'_> {
     /// The I2C bus of a chip.
     pub(super) fn i2c(&mut self, section: &Section) -> Result<String, Trouble> {
         let mcu = section.text("i2c_mcu").unwrap_or(MAIN).to_owned();
-        if section.text("i2c_software_scl_pin").is_some() {
-            let [scl, sda] = ["i2c_software_scl_pin", "i2c_software_sda_pin"].map(|key| self.pin(section, key));
+        // The MCP4018 had other names for its lines until v0.13.
+        let lines = [["i2c_software_scl_pin", "i2c_software_sda_pin"], ["scl_pin", "sda_pin"]];
+        if let Some(keys) = lines.into_iter().find(|[scl, _]| section.text(scl).is_some()) {
+            let [scl, sda] = keys.map(|key| self.pin(section, key));
             let [scl, sda] = [scl?, sda?].map(|pin| pin.map(|pin| Translator::on(&mcu, &pin.name)));
             return Ok(self.soft_bus(section, "i2c_bus", [("scl_pin", scl), ("sda_pin", sda)]));
         }
@@ -258,7 +290,7 @@ impl Translator<'_> {
     fn strangers(&mut self) {
         let mut named = BTreeSet::new();
         for section in self.config.sections() {
-            if !named.insert(section.kind()) {
+            if self.left_out.sections.contains(&section.name) || !named.insert(section.kind()) {
                 continue;
             }
             match kind_of(section.kind()) {

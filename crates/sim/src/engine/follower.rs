@@ -11,7 +11,8 @@ use pinion_firmware::time::Clock;
 #[derive(Debug)]
 pub(crate) struct Follower {
     motor: Arc<Motor>,
-    next: u64,
+    /// The number of the next step.
+    number: u64,
     /// The position after the last step that was read.
     steps: i64,
     /// A step that was read and not taken yet.
@@ -45,32 +46,41 @@ impl Motion {
 impl Follower {
     /// Follows from the first step that the motor makes.
     fn new(motor: Arc<Motor>) -> Follower {
-        Follower { steps: motor.steps(), motor, next: 0, pending: None }
+        Follower { steps: motor.steps(), motor, number: 0, pending: None }
     }
 
     /// Follows from the next step that the motor makes.
-    fn from_here(motor: Arc<Motor>) -> Follower {
-        Follower { next: motor.track().next(), steps: motor.steps(), motor, pending: None }
+    pub(crate) fn from_here(motor: Arc<Motor>) -> Follower {
+        Follower { number: motor.track().next(), steps: motor.steps(), motor, pending: None }
     }
 
     /// The next motion, if it was not later than `until`.
     fn look(&mut self, until: Clock) -> Option<Motion> {
         let mut lost = false;
         while self.pending.is_none() {
-            match self.motor.track().get(self.next) {
+            match self.motor.track().get(self.number) {
                 Recorded::Step(at, steps) => {
-                    self.next += 1;
+                    self.number += 1;
                     self.pending = Some(if lost { Motion::Lost(at, steps) } else { Motion::Step(at, steps) });
                 }
                 Recorded::NotYet => return None,
                 // Continue at half of the track, while the writer overwrites the other half.
                 Recorded::Overwritten => {
-                    self.next = self.motor.track().next().saturating_sub(KEPT as u64 / 2);
+                    self.number = self.motor.track().next().saturating_sub(KEPT as u64 / 2);
                     lost = true;
                 }
             }
         }
         self.pending.filter(|motion| motion.at() <= until)
+    }
+
+    /// The next motion, if it was not later than `until`. It is taken.
+    pub(crate) fn next(&mut self, until: Clock) -> Option<Motion> {
+        let motion = self.look(until);
+        if motion.is_some() {
+            self.take();
+        }
+        motion
     }
 
     fn take(&mut self) {

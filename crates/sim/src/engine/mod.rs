@@ -10,6 +10,7 @@ pub(crate) mod linkage;
 pub(crate) mod look;
 pub(crate) mod motion;
 pub(crate) mod noise;
+pub(crate) mod pace;
 pub(crate) mod physics;
 pub(crate) mod recorder;
 pub(crate) mod ring;

@@ -273,6 +273,11 @@ impl Axis {
         &self.rail
     }
 
+    /// Its motor.
+    pub(crate) fn motor(&self) -> &Arc<Motor> {
+        &self.motor
+    }
+
     /// The position of its motor.
     pub fn position_steps(&self) -> i64 {
         self.motor.steps()

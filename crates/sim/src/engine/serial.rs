@@ -2,12 +2,13 @@
 //! The simulated printer's serial ports. RX and TX of a port are on one wire, together with the chips.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread;
 use std::time::Duration;
 
 use pinion_firmware::board::SerialPort;
 use pinion_firmware::time::{Clock, TimeSource};
 use pinion_firmware::trouble::Trouble;
+
+use super::time::pass;
 
 /// A chip on the wire.
 pub(crate) trait SerialChip: Send {
@@ -56,7 +57,7 @@ pub(crate) struct SerialDevice {
 impl SerialDevice {
     /// The time of bytes with start and stop bits.
     fn pass(&self, bytes: usize) {
-        thread::sleep(Duration::from_secs_f64(10.0 * bytes as f64 / f64::from(self.rate_hz.max(1))));
+        pass(Duration::from_secs_f64(10.0 * bytes as f64 / f64::from(self.rate_hz.max(1))));
     }
 }
 
@@ -71,7 +72,7 @@ impl SerialPort for SerialDevice {
     fn receive(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, Trouble> {
         let count = bytes.len().min(self.received.len());
         match count {
-            0 => thread::sleep(limit),
+            0 => pass(limit),
             _ => self.pass(count),
         }
         bytes[..count].copy_from_slice(&self.received[..count]);

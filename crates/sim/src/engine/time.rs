@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use pinion_firmware::time::{CLOCK_FREQ, Clock, Due, Ticks, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, Due, NS_PER_TICK, Ticks, TimeSource};
 
 /// Seconds from `earlier` to `later`; 0 if they are the other way round.
 pub fn seconds(earlier: Clock, later: Clock) -> f64 {
@@ -82,6 +82,10 @@ impl TimeSource for BoardClock {
         self.clock.spin_until(self.drift.of_printer(end));
     }
 
+    fn sleep_until(&self, end: Clock) {
+        self.clock.sleep_until(self.drift.of_printer(end));
+    }
+
     fn step_ns(&self) -> u32 {
         self.clock.step_ns()
     }
@@ -120,10 +124,13 @@ impl PrinterTime {
     pub(crate) fn of_the_caller(&self) -> Clock {
         self.drift.of_printer(JOB.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now()))
     }
+}
 
-    fn sleep_until(&self, end: Clock) {
-        let ticks = end.since(self.clock.now()).max(0) as u64;
-        thread::sleep(Duration::from_micros(ticks / u64::from(Ticks::from_us(1).0)));
+/// A device takes this long for the job of the caller.
+pub(crate) fn pass(span: Duration) {
+    match JOB.get() {
+        Some(now) => JOB.set(Some(now.later(span.as_nanos() as u64 / NS_PER_TICK))),
+        None => thread::sleep(span),
     }
 }
 
@@ -147,7 +154,7 @@ impl TimeSource for PrinterTime {
         let Some(now) = JOB.get() else { return self.clock.spin_until(end) };
         JOB.set(Some(now.max(end)));
         if end.since(self.clock.now()) > i64::from(AHEAD.0) {
-            self.sleep_until(end);
+            self.clock.sleep_until(end);
         }
     }
 
@@ -155,17 +162,16 @@ impl TimeSource for PrinterTime {
     fn run_job(&self, work: &mut dyn FnMut()) -> Clock {
         JOB.set(Some(self.clock.now()));
         work();
-        if let Some(end) = JOB.take() {
-            self.sleep_until(end);
-        }
-        self.clock.now()
+        let Some(end) = JOB.take() else { return self.clock.now() };
+        self.clock.sleep_until(end);
+        end.max(self.clock.now())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::time::{NS_PER_TICK, VirtualClock};
+    use pinion_firmware::time::VirtualClock;
 
     #[test]
     fn a_job_does_not_feel_how_late_the_computer_is() {

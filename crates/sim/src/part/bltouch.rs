@@ -151,6 +151,8 @@ struct State {
     since: Clock,
     touch_mode: bool,
     alarm: bool,
+    /// Whether a touch has pushed the pin up, and no command has come since: it falls again where it has room.
+    falls: bool,
     /// The end of the sensor line's pulse.
     touched: Option<Clock>,
     /// When the control line's pulse began.
@@ -169,18 +171,20 @@ impl State {
             | u64::from(self.touch_mode) << 2
             | u64::from(self.alarm) << 3
             | u64::from(self.touched.is_some()) << 4
-            | command << 5;
+            | u64::from(self.falls) << 5
+            | command << 6;
         let touched = self.touched.map_or(0, Clock::ticks);
         [flags, self.since.ticks(), touched, self.rise.ticks(), self.commanded.ticks()]
     }
 
     fn of([flags, since, touched, rise, commanded]: [u64; 5]) -> State {
-        let command = flags >> 5;
+        let command = flags >> 6;
         State {
             way: [Way::Up, Way::Down, Way::SelfTest, Way::Up][(flags & 3) as usize],
             since: Clock::from_ticks(since),
             touch_mode: flags & 4 != 0,
             alarm: flags & 8 != 0,
+            falls: flags & 32 != 0,
             touched: (flags & 16 != 0).then(|| Clock::from_ticks(touched)),
             rise: Clock::from_ticks(rise),
             command: (command != NO_COMMAND).then_some(command as usize),
@@ -206,6 +210,7 @@ impl Bltouch {
             since: start,
             touch_mode: false,
             alarm: false,
+            falls: false,
             touched: None,
             rise: start,
             command: None,
@@ -231,6 +236,9 @@ impl Bltouch {
         if state.alarm || elapsed_s < self.move_s {
             return state;
         }
+        if state.falls && !self.is_against_the_bed() {
+            (state.way, state.falls) = (Way::Down, false);
+        }
         match state.way {
             Way::Up => state.alarm = self.jams == Some(Jam::Down) && !state.touch_mode,
             Way::SelfTest if elapsed_s >= 2.0 * SELF_TEST_ROUNDS * self.move_s => state.way = Way::Up,
@@ -243,6 +251,7 @@ impl Bltouch {
                 state.way = Way::Up;
                 state.since = now;
                 state.touched = Some(now);
+                state.falls = true;
             }
             Way::Down => {}
         }
@@ -297,7 +306,7 @@ impl Bltouch {
             Command::Reset => state.alarm = false,
             _ => {}
         }
-        state.touch_mode = false;
+        (state.touch_mode, state.falls) = (false, false);
         // The pin does not move during the alarm.
         if state.alarm {
             return;
@@ -434,6 +443,27 @@ mod tests {
         assert!(!bench.sensor());
     }
 
+    /// klippy's `stow_on_each_sample: False`, without touch mode.
+    #[test]
+    fn a_pin_that_nobody_stows_falls_again_after_a_touch() {
+        let mut bench = Bench::new(None);
+        bench.send(650.0);
+        for _ in 0..3 {
+            bench.move_z(-10.0);
+            assert!(bench.sensor());
+            bench.wait(0.4);
+            assert_eq!((bench.sensor(), bench.seen().as_str()), (false, "pin up"));
+            bench.move_z(10.0);
+            bench.wait(0.4);
+            assert_eq!((bench.sensor(), bench.seen().as_str()), (false, "pin down"));
+        }
+        bench.move_z(-10.0);
+        assert!(bench.sensor());
+        bench.send(1475.0);
+        bench.move_z(10.0);
+        assert_eq!(bench.seen(), "pin up", "it is stowed");
+    }
+
     #[test]
     fn commands_are_known_by_their_widths() {
         let mut bench = Bench::new(None);
@@ -525,8 +555,13 @@ mod tests {
     #[test]
     fn a_state_is_the_same_after_it_was_stored() {
         let bench = Bench::new(None);
-        let state =
-            State { touched: Some(bench.now), command: Some(7), way: Way::SelfTest, ..bench.probe.at(bench.now) };
+        let state = State {
+            touched: Some(bench.now),
+            command: Some(7),
+            way: Way::SelfTest,
+            falls: true,
+            ..bench.probe.at(bench.now)
+        };
         assert_eq!(State::of(state.words()), state);
     }
 }

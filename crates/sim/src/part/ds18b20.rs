@@ -3,7 +3,6 @@
 //! Measuring Temperature"): steps of 1/16 of a degree, 750 ms for a conversion.
 
 use std::sync::Arc;
-use std::thread;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -12,6 +11,7 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
+use crate::engine::time::pass;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::board::Thermometer;
@@ -77,7 +77,7 @@ struct Ds18b20 {
 
 impl Thermometer for Ds18b20 {
     fn read(&mut self) -> Result<i32, Trouble> {
-        thread::sleep(self.conversion);
+        pass(self.conversion);
         let sixteenths = (self.heater.at(self.clock.now()).celsius * 16.0).floor() as i32;
         Ok((sixteenths * 1000).div_euclid(16))
     }

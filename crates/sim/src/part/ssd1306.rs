@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The display controller SSD1306 with a panel of 128 x 64, on I2C or SPI, after its data sheet (Solomon
-//! Systech SSD1306, rev. 1.1: "MCU Interface", "Command Table", "Graphic Display Data RAM").
+//! Systech SSD1306, rev. 1.1: "MCU Interface", "Command Table", "Graphic Display Data RAM"). Also the SH1106 (Sino Wealth),
+//! which has 132 columns: a module's panel is at the middle ones.
 //!
 //! The panel is mounted as on the usual modules. The picture is upright if the segments are remapped (A1) and the COM
 //! outputs are scanned downward (C8). The COM outputs are wired alternately (DA 12).
@@ -35,12 +36,38 @@ const ROWS: u8 = 64;
 /// The address of a module with SA0 low.
 const ADDRESS: u8 = 0x3c;
 
+/// The columns of the SH1106.
+const MORE_COLUMNS: u8 = 132;
+
+/// A display controller.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DisplayChip {
+    /// 128 columns.
+    #[default]
+    Ssd1306,
+    /// It addresses by pages only, and its converter is on after a reset.
+    Sh1106,
+}
+
+impl DisplayChip {
+    fn columns(self) -> u8 {
+        match self {
+            DisplayChip::Ssd1306 => COLUMNS,
+            DisplayChip::Sh1106 => MORE_COLUMNS,
+        }
+    }
+}
+
 /// The display's description.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ssd1306Config {
     /// For example `display`.
     pub name: String,
+    /// The controller.
+    #[serde(default)]
+    pub chip: DisplayChip,
     /// Its bus: I2C, or SPI if it has a `dc_pin`.
     pub bus: String,
     /// Its address on I2C.
@@ -82,7 +109,7 @@ impl Part for Ssd1306Config {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
-        let panel = Arc::new(Panel::new(&self.name, workshop.noise(self)));
+        let panel = Arc::new(Panel::new(&self.name, self.chip, workshop.noise(self)));
         workshop.wire(self.dc_pin.as_ref(), mode_pin(panel.clone()));
         workshop.wire(self.reset_pin.as_ref(), reset_pin(panel.clone()));
         match self.dc_pin {
@@ -99,7 +126,13 @@ impl Part for Ssd1306Config {
             "display" => cfg.section("display"),
             name => cfg.section(format_args!("display {name}")),
         }
-        cfg.key("lcd_type", "ssd1306");
+        match self.chip {
+            DisplayChip::Ssd1306 => cfg.key("lcd_type", "ssd1306"),
+            DisplayChip::Sh1106 => {
+                cfg.key("lcd_type", "sh1106");
+                cfg.key("x_offset", (MORE_COLUMNS - COLUMNS) / 2);
+            }
+        }
         match &self.dc_pin {
             Some(pin) => {
                 cfg.spi(&self.bus, self.select_pin.as_ref());
@@ -134,8 +167,9 @@ enum Addressing {
 
 #[derive(Clone)]
 struct Chip {
+    kind: DisplayChip,
     /// By page and segment; bit 0 is the page's topmost row.
-    memory: [[u8; COLUMNS as usize]; PAGES as usize],
+    memory: [[u8; MORE_COLUMNS as usize]; PAGES as usize],
     settings: Settings,
     /// A command with incomplete arguments.
     command: Vec<u8>,
@@ -201,8 +235,13 @@ impl Chip {
         let is = &mut self.settings;
         match (command, arguments) {
             // Column of the page addressing mode.
-            (0x00..=0x0f, _) => is.column = is.column & 0x70 | command & 0x0f,
-            (0x10..=0x1f, _) => is.column = (command & 0x07) << 4 | is.column & 0x0f,
+            (0x00..=0x0f, _) => is.column = is.column & 0xf0 | command & 0x0f,
+            (0x10..=0x1f, _) => {
+                let column = (command & 0x0f) << 4 | is.column & 0x0f;
+                is.column =
+                    if self.kind == DisplayChip::Ssd1306 { column & 0x7f } else { column.min(MORE_COLUMNS - 1) };
+            }
+            (0x20..=0x22, _) if self.kind == DisplayChip::Sh1106 => {}
             (0x20, [mode]) => {
                 is.addressing = match mode & 3 {
                     0 => Addressing::Horizontal,
@@ -236,9 +275,10 @@ impl Chip {
 
     fn data(&mut self, byte: u8) {
         let is = &mut self.settings;
-        let segment = if is.segments_remapped { COLUMNS - 1 - is.column } else { is.column };
+        let columns = self.kind.columns();
+        let segment = if is.segments_remapped { columns - 1 - is.column } else { is.column };
         self.memory[usize::from(is.page)][usize::from(segment)] = byte;
-        let last = is.column == COLUMNS - 1;
+        let last = is.column == columns - 1;
         let after = |at: u8, (start, end): (u8, u8), count: u8| {
             if at == end { (start, true) } else { ((at + 1) % count, false) }
         };
@@ -263,14 +303,15 @@ impl Chip {
 
     /// Whether any pixel can light up.
     fn is_lit(&self) -> bool {
-        self.settings.on && self.settings.charge_pump
+        self.settings.on && (self.settings.charge_pump || self.kind == DisplayChip::Sh1106)
     }
 
     /// Whether the pixel at this place is bright; the origin is the panel's upper left corner.
     fn pixel(&self, x: u8, y: u8) -> bool {
         let is = &self.settings;
         // The panel's left column is the last segment. Its first row is the last COM output.
-        let (segment, com) = (COLUMNS - 1 - x, ROWS - 1 - y);
+        let margin = (self.kind.columns() - COLUMNS) / 2;
+        let (segment, com) = (margin + COLUMNS - 1 - x, ROWS - 1 - y);
         let shifted = (com + is.offset) % ROWS;
         if shifted >= is.multiplex {
             return false;
@@ -283,11 +324,11 @@ impl Chip {
 }
 
 impl Panel {
-    fn new(name: &str, mut noise: Noise) -> Panel {
+    fn new(name: &str, kind: DisplayChip, mut noise: Noise) -> Panel {
         let memory = std::array::from_fn(|_| std::array::from_fn(|_| (noise.draw() * 1000.0) as i64 as u8));
         Panel {
             name: name.to_owned(),
-            chip: Mutex::new(Chip { memory, settings: Settings::RESET, command: Vec::new() }),
+            chip: Mutex::new(Chip { kind, memory, settings: Settings::RESET, command: Vec::new() }),
             is_data: AtomicBool::new(false),
             held: AtomicBool::new(false),
             was_reset: AtomicBool::new(false),
@@ -409,7 +450,11 @@ mod tests {
 
     impl Bench {
         fn new() -> Bench {
-            let panel = Arc::new(Panel::new("display", Noise::of("display", 1)));
+            Bench::of(DisplayChip::Ssd1306)
+        }
+
+        fn of(chip: DisplayChip) -> Bench {
+            let panel = Arc::new(Panel::new("display", chip, Noise::of("display", 1)));
             Bench { i2c: OnI2c { panel: panel.clone(), control: None }, panel }
         }
 
@@ -463,6 +508,29 @@ mod tests {
         bench.write(&[0x00, 0xc8]);
         bench.write(&[0x40, 0x01]);
         assert_eq!(bench.bright(), [(0, 0), (125, 0), (1, 7)]);
+    }
+
+    #[test]
+    fn an_sh1106_shows_its_middle_columns() {
+        let mut bench = Bench::of(DisplayChip::Sh1106);
+        // As klippy does it: by pages, each with all columns.
+        bench.write(&[0x00, 0xa1, 0xc8, 0xda, 0x12, 0xa4, 0xa6, 0xaf]);
+        for page in 0..PAGES {
+            bench.write(&[0x00, 0xb0 | page, 0x10, 0x00]);
+            bench.write(&[&[0x40][..], &[0; MORE_COLUMNS as usize]].concat());
+        }
+        assert_eq!(bench.bright(), []);
+        for (column, x) in [(2, 0), (129, 127)] {
+            bench.write(&[0x00, 0xb0, 0x10 | column >> 4, column & 0x0f]);
+            bench.write(&[0x40, 1]);
+            assert!(bench.bright().contains(&(x, 0)), "{column}: {:?}", bench.bright());
+        }
+        // The outer columns have no place on the panel.
+        for column in [0, 1, 130, 131] {
+            bench.write(&[0x00, 0xb0, 0x10 | column >> 4, column & 0x0f]);
+            bench.write(&[0x40, 1]);
+        }
+        assert_eq!(bench.bright(), [(0, 0), (127, 0)]);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::super::Computer;
-use super::super::board::{Board, Boot, model};
+use super::super::board::{Board, Boot, is_pi, is_pi5, model, pi_config};
 use super::lines::Names;
 use super::{Resource, Source, Use, Uses};
 
@@ -41,13 +41,73 @@ impl Loaded {
     fn set(&self, key: &str) -> Option<&str> {
         self.parameters.iter().rev().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
     }
+
+    /// Whether it is this one, such as `anyspi:spi0-0,dev="microchip,mcp3208"`, with all its parameters. Its user may have
+    /// added others.
+    pub(in crate::cli) fn is(&self, wanted: &str) -> bool {
+        let (name, wanted) = wanted.split_at(wanted.find([',', ':']).unwrap_or(wanted.len()));
+        self.name == name
+            && parameters(wanted.get(1..).unwrap_or_default()).iter().all(|one| self.parameters.contains(one))
+    }
 }
 
-/// The lines of a config.txt and of the files that it includes.
-pub(in crate::cli) fn lines(computer: &Computer, board: &Board, file: &str) -> Vec<Line> {
-    let mut found = Vec::new();
-    read(computer, &sections(computer, board), Path::new(file), 0, &mut State::default(), &mut found);
-    found
+/// A Raspberry Pi's config.txt, with the files that it includes. Other computers have an empty one.
+#[derive(Clone, Debug, Default)]
+pub(in crate::cli) struct ConfigTxt {
+    /// The sections that apply to this model.
+    pub(in crate::cli) sections: &'static [&'static str],
+    lines: Vec<Line>,
+    /// The overlays, and the file's own parameters as those of an overlay without a name.
+    pub(in crate::cli) loaded: Vec<Loaded>,
+}
+
+impl ConfigTxt {
+    pub(in crate::cli) fn read(computer: &Computer, board: Option<&Board>) -> ConfigTxt {
+        let is_there = board.map_or_else(|| is_pi(computer), |board| board.boot == Boot::ConfigTxt);
+        let Some(file) = pi_config(computer).filter(|_| is_there) else { return ConfigTxt::default() };
+        let sections = sections(computer);
+        let mut lines = Vec::new();
+        read(computer, sections, Path::new(file), 0, &mut State::default(), &mut lines);
+        let loaded = loaded(&lines, is_pi5(computer));
+        ConfigTxt { sections, lines, loaded }
+    }
+
+    /// The value of a key that is no overlay and no parameter. The last line counts.
+    pub(in crate::cli) fn value(&self, key: &str) -> Option<&str> {
+        let sure = self.lines.iter().filter(|line| line.applies == Some(true));
+        let mut settings = sure.filter_map(|line| line.text.split_once('='));
+        settings.rfind(|(own, _)| own.trim() == key).map(|(_, value)| value.trim())
+    }
+
+    /// The value of a parameter of the file's own.
+    fn parameter(&self, key: &str) -> Option<&str> {
+        let base = self.loaded.iter().filter(|loaded| loaded.name.is_empty() && loaded.is_sure);
+        let mut all = base.flat_map(|loaded| &loaded.parameters);
+        all.rfind(|(own, _)| parameter(own) == parameter(key)).map(|(_, value)| value.as_str())
+    }
+
+    /// Whether it has the effect of this line.
+    pub(in crate::cli) fn has(&self, wanted: &str) -> bool {
+        if let Some(wanted) = wanted.strip_prefix("dtparam=") {
+            let (key, value) = wanted.split_once('=').unwrap_or((wanted, "on"));
+            return self.parameter(key).is_some_and(|own| own == value || is_on(own) && is_on(value));
+        }
+        if let Some(overlay) = wanted.strip_prefix("dtoverlay=") {
+            return self.loaded.iter().any(|loaded| loaded.is_sure && loaded.is(overlay));
+        }
+        wanted.split_once('=').is_some_and(|(key, value)| self.value(key) == Some(value))
+    }
+
+    /// Whether an overlay or a parameter whose name begins like this is on.
+    pub(in crate::cli) fn enables(&self, beginning: &str) -> bool {
+        self.loaded.iter().any(|loaded| match loaded.name.as_str() {
+            "" => loaded
+                .parameters
+                .iter()
+                .any(|(key, _)| parameter(key).starts_with(beginning) && self.parameter(key).is_some_and(is_on)),
+            name => name.starts_with(beginning),
+        })
+    }
 }
 
 /// The conditions of the sections that are open.
@@ -105,31 +165,43 @@ fn is_model(section: &str) -> bool {
     rest.is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()))
 }
 
+/// The sections of config.txt that apply to a model. The first name that is part of the model's counts.
+const SECTIONS: [(&str, &[&str]); 18] = [
+    ("Pi 500", &["pi5", "pi500"]),
+    ("Pi 5", &["pi5"]),
+    ("Compute Module 5", &["pi5", "cm5"]),
+    ("Pi 400", &["pi4", "pi400"]),
+    ("Pi 4", &["pi4"]),
+    ("Compute Module 4S", &["pi4", "cm4s"]),
+    ("Compute Module 4", &["pi4", "cm4"]),
+    ("Pi 3 Model B Plus", &["pi3", "pi3+"]),
+    ("Pi 3 Model B+", &["pi3", "pi3+"]),
+    ("Pi 3 Model A", &["pi3", "pi3+"]),
+    ("Pi 3", &["pi3"]),
+    ("Compute Module 3", &["pi3", "cm3"]),
+    ("Pi 2 Model", &["pi2"]),
+    ("Pi Zero 2", &["pi02", "pi0w", "pi0"]),
+    ("Pi Zero W", &["pi0w", "pi0"]),
+    ("Pi Zero", &["pi0"]),
+    ("Compute Module", &["cm1", "pi1"]),
+    ("Pi Model", &["pi1"]),
+];
+
 /// The sections of config.txt that apply to this computer's model.
-fn sections(computer: &Computer, board: &Board) -> Vec<&'static str> {
+fn sections(computer: &Computer) -> &'static [&'static str] {
     let model = model(computer);
-    let has = |name: &str| model.contains(name);
-    match board.id {
-        "raspberry-pi-5" if has("500") => vec!["pi5", "pi500"],
-        "raspberry-pi-5" => vec!["pi5"],
-        "raspberry-pi-4" if has("400") => vec!["pi4", "pi400"],
-        "raspberry-pi-4" => vec!["pi4"],
-        _ if has("Zero 2") => vec!["pi02", "pi0w", "pi0"],
-        _ if has("Pi 3") && (has("Plus") || has("+")) => vec!["pi3", "pi3+"],
-        _ if has("Pi 3") => vec!["pi3"],
-        _ if has("Pi 2") => vec!["pi2"],
-        _ => Vec::new(),
-    }
+    SECTIONS.iter().find(|(name, _)| model.contains(name)).map_or(&[], |(_, sections)| sections)
 }
 
-/// The overlays of a config.txt, and its own parameters as those of an overlay without a name.
-pub(in crate::cli) fn loaded(lines: &[Line], board: &Board) -> Vec<Loaded> {
+/// The parameters of an overlay.
+fn parameters(text: &str) -> Vec<(String, String)> {
+    let parts = text.split(',').map(str::trim).filter(|part| !part.is_empty());
+    let pairs = parts.map(|part| part.split_once('=').unwrap_or((part, "on")));
+    pairs.map(|(key, value)| (key.trim().to_owned(), value.trim().to_owned())).collect()
+}
+
+fn loaded(lines: &[Line], is_pi5: bool) -> Vec<Loaded> {
     let mut all = vec![];
-    let parameters = |text: &str| -> Vec<(String, String)> {
-        let parts = text.split(',').map(str::trim).filter(|part| !part.is_empty());
-        let pairs = parts.map(|part| part.split_once('=').unwrap_or((part, "on")));
-        pairs.map(|(key, value)| (key.trim().to_owned(), value.trim().to_owned())).collect()
-    };
     // A parameter belongs to the overlay before it, if that has it.
     let mut open: Option<usize> = None;
     for Line { text, place, applies } in lines.iter().filter(|line| line.applies != Some(false)) {
@@ -141,7 +213,7 @@ pub(in crate::cli) fn loaded(lines: &[Line], board: &Board) -> Vec<Loaded> {
             if !name.trim().is_empty() {
                 open = Some(all.len());
                 let parameters = parameters(rest.get(1..).unwrap_or_default());
-                let takes = entry(name.trim(), board);
+                let takes = entry(name.trim(), is_pi5);
                 all.push(Loaded { name: name.trim().to_owned(), takes, ..base(parameters) });
             }
         } else if let Some(text) = text.strip_prefix("dtparam=") {
@@ -160,7 +232,7 @@ pub(in crate::cli) fn loaded(lines: &[Line], board: &Board) -> Vec<Loaded> {
 }
 
 /// What an overlay takes, from the table. `None` if it is not known.
-fn entry(name: &str, board: &Board) -> Option<&'static str> {
+fn entry(name: &str, is_pi5: bool) -> Option<&'static str> {
     let of = |name: &str| {
         let mut entries = OVERLAYS.lines().filter(|line| !line.starts_with('#') && !line.is_empty());
         entries.find_map(|line| {
@@ -168,7 +240,7 @@ fn entry(name: &str, board: &Board) -> Option<&'static str> {
             (own == name).then_some(takes)
         })
     };
-    let pi5 = if board.id == "raspberry-pi-5" { of(&format!("{name}-pi5")) } else { None };
+    let pi5 = is_pi5.then(|| of(&format!("{name}-pi5"))).flatten();
     pi5.or_else(|| of(name))
 }
 
@@ -196,12 +268,12 @@ fn two_pins(key: &str) -> Option<[u32; 2]> {
 }
 
 /// Whether config.txt switches something on with this value.
-pub(in crate::cli) fn is_on(value: &str) -> bool {
+fn is_on(value: &str) -> bool {
     ["on", "true", "yes", "1", ""].contains(&value)
 }
 
 /// A parameter of config.txt by its usual name. The others are in overlays/README.
-pub(in crate::cli) fn parameter(name: &str) -> &str {
+fn parameter(name: &str) -> &str {
     match name {
         "i2c" | "i2c1" => "i2c_arm",
         "i2c0" => "i2c_vc",
@@ -210,22 +282,49 @@ pub(in crate::cli) fn parameter(name: &str) -> &str {
     }
 }
 
+/// The settings in an armbianEnv.txt or its like, with the numbers of their lines. The last one of a name counts.
+pub(in crate::cli) struct Env<'a>(BTreeMap<&'a str, (usize, &'a str)>);
+
+impl<'a> Env<'a> {
+    pub(in crate::cli) fn of(text: &'a str) -> Env<'a> {
+        let settings = (1..).zip(text.lines()).filter_map(|(number, line)| {
+            let (key, value) = line.split_once('=').filter(|(key, _)| !key.starts_with('#'))?;
+            Some((key.trim(), (number, value.trim())))
+        });
+        Env(settings.collect())
+    }
+
+    pub(in crate::cli) fn value(&self, key: &str) -> Option<&'a str> {
+        self.0.get(key).map(|(_, value)| *value)
+    }
+
+    /// An overlay's name without the prefix that the boot loader adds.
+    pub(in crate::cli) fn short<'b>(&self, name: &'b str) -> &'b str {
+        let prefix = self.value("overlay_prefix").unwrap_or_default();
+        name.strip_prefix(prefix).and_then(|name| name.strip_prefix('-')).unwrap_or(name)
+    }
+
+    /// Whether this overlay is the one of a bus, with its parameters.
+    pub(in crate::cli) fn is(&self, name: &str, way: &[String]) -> bool {
+        let set = |line: &String| line.split_once('=').is_some_and(|(key, value)| self.value(key) == Some(value));
+        way.split_first()
+            .is_some_and(|(own, parameters)| self.short(own) == self.short(name) && parameters.iter().all(set))
+    }
+}
+
 impl Uses {
     /// Adds what the boot loader's settings take.
-    pub(super) fn add_boot(&mut self, computer: &Computer, board: &Board) {
-        let Some(file) = computer.first(&board.files.iter().map(String::as_str).collect::<Vec<_>>()) else { return };
-        match board.boot {
-            Boot::ConfigTxt => {
-                self.loaded = loaded(&lines(computer, board, file), board);
-                let loaded = self.loaded.clone();
-                for (at, one) in loaded.iter().enumerate() {
-                    match one.name.as_str() {
-                        "" => self.add_parameters(one, &loaded[at + 1..]),
-                        _ => self.add_overlay(one),
-                    }
-                }
+    pub(super) fn add_boot(&mut self, computer: &Computer) {
+        let loaded = self.config_txt.loaded.clone();
+        for (at, one) in loaded.iter().enumerate() {
+            match one.name.as_str() {
+                "" => self.add_parameters(one, &loaded[at + 1..]),
+                _ => self.add_overlay(one),
             }
-            Boot::Overlays => self.add_env(computer, board, file),
+        }
+        let board = self.board.clone().filter(|board| board.boot == Boot::Overlays);
+        if let Some((board, file)) = board.as_ref().and_then(|board| Some((board, board.file(computer)?))) {
+            self.add_env(computer, board, file);
         }
     }
 
@@ -314,18 +413,11 @@ impl Uses {
     /// Adds the overlays of an armbianEnv.txt or its like. Only those that a board's file names are known.
     fn add_env(&mut self, computer: &Computer, board: &Board, file: &str) {
         let text = computer.text(file).unwrap_or_default();
-        let mut values: BTreeMap<&str, (usize, &str)> = BTreeMap::new();
-        for (number, line) in (1..).zip(text.lines()) {
-            if let Some((key, value)) = line.split_once('=').filter(|(key, _)| !key.starts_with('#')) {
-                values.insert(key.trim(), (number, value.trim()));
-            }
-        }
-        let value = |key: &str| values.get(key).map_or("", |(_, value)| value);
-        let prefix = format!("{}-", value("overlay_prefix"));
+        let env = Env::of(&text);
         for key in ["overlays", "user_overlays"] {
-            let Some((number, names)) = values.get(key) else { continue };
+            let Some((number, names)) = env.0.get(key) else { continue };
             for name in names.split_whitespace() {
-                let name = name.strip_prefix(&prefix).unwrap_or(name);
+                let name = env.short(name);
                 let one = |what, function| Use {
                     what,
                     user: format!("overlay {name}"),
@@ -333,20 +425,15 @@ impl Uses {
                     source: Source::Boot,
                     function,
                 };
-                let is_its = |way: &Vec<String>| {
-                    way.split_first().is_some_and(|(own, parameters)| {
-                        let set =
-                            |line: &String| line.split_once('=').is_some_and(|(key, wanted)| value(key) == wanted);
-                        (own == name || own.strip_prefix(&prefix) == Some(name)) && parameters.iter().all(set)
-                    })
-                };
-                let buses: Vec<_> = board.bus.values().filter(|bus| bus.overlays.iter().any(is_its)).collect();
+                let is_its = |way: &Vec<String>| env.is(name, way);
                 let names = Names::of(computer, Some(board), None);
-                if let Some(bus) = buses.first() {
+                if let Some(bus) = board.bus.values().find(|bus| bus.overlays.iter().any(is_its)) {
                     let function = super::super::board::function(&bus.node);
                     let lines = bus.all_pins().filter_map(|pin| names.of_pin(board, pin));
                     lines.for_each(|line| self.add(one(Resource::Line(line), Some(function.clone()))));
-                } else if let ("w1-gpio", Some(line)) = (name, names.meant(value("param_w1_pin"), Some(board))) {
+                } else if let ("w1-gpio", Some(line)) =
+                    (name, names.meant(env.value("param_w1_pin").unwrap_or_default(), Some(board)))
+                {
                     self.add(one(Resource::Line(line), Some("w1".to_owned())));
                 } else if ["tft35_spi", "mcp2515"].contains(&name) {
                     // Both have the chip select of the header (BigTreeTech's docs/CB1.md).

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use pinion_linux::Inventory;
 
 use super::super::Computer;
-use super::super::board::{Board, Maker, is_pi, model};
+use super::super::board::{Board, Maker, is_pi, is_pi5};
 use super::super::printer::line_of;
 
 /// The lines of an Allwinner's two pin controllers. The second one begins with the bank PL.
@@ -42,9 +42,7 @@ impl Names {
             Some((inventory, header)) => {
                 (0..16).filter(|n| *n == header.number || inventory.renumbered(*n).is_some()).collect()
             }
-            None if model(computer).contains("Pi 5") || board.is_some_and(|board| board.id == "raspberry-pi-5") => {
-                vec![0, 4]
-            }
+            None if is_pi5(computer) => vec![0, 4],
             None => vec![0],
         };
         Names { maker, header, chips, named }

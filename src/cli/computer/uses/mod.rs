@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use pinion_linux::Inventory;
 use pinion_linux::sysfs::Sysfs;
+use pinion_printer_config::Section;
 use serde_json::{Value, json};
 
 use super::Computer;
@@ -49,6 +50,19 @@ pub(in crate::cli) enum Resource {
     Device(String),
     /// Anything: nobody knows what this overlay or this configuration takes.
     Unknown(String),
+}
+
+impl Resource {
+    /// The function of a board that has it, as [`board::function`] names it.
+    pub(in crate::cli) fn function(&self) -> Option<String> {
+        match self {
+            Resource::Select(bus, _) | Resource::Controller(bus) => Some(format!("spi{bus}")),
+            Resource::I2c(bus, _) => Some(format!("i2c{bus}")),
+            Resource::Sensor(_) => Some("w1".to_owned()),
+            Resource::Pwm(name) | Resource::Port(name) => Some(board::function(name)),
+            Resource::Line(_) | Resource::Device(_) | Resource::Unknown(_) => None,
+        }
+    }
 }
 
 impl std::fmt::Display for Resource {
@@ -106,11 +120,10 @@ pub(in crate::cli) struct Uses {
     pub(in crate::cli) names: Names,
     pub(in crate::cli) board: Option<Board>,
     pub(in crate::cli) all: Vec<Use>,
-    /// The overlays of config.txt.
-    pub(in crate::cli) loaded: Vec<boot::Loaded>,
+    pub(in crate::cli) config_txt: boot::ConfigTxt,
     pub(in crate::cli) no_lines: Vec<NoLine>,
-    /// The name of this computer's MCU in each configuration.
-    pub(in crate::cli) mcus: BTreeMap<PathBuf, String>,
+    /// The configurations of klippys that can be read, with this computer's MCUs in each.
+    pub(in crate::cli) printers: BTreeMap<PathBuf, (Printer, BTreeMap<String, PathBuf>)>,
 }
 
 impl Uses {
@@ -127,13 +140,11 @@ impl Uses {
             names,
             board: board.cloned(),
             all: Vec::new(),
-            loaded: Vec::new(),
+            config_txt: boot::ConfigTxt::read(computer, board),
             no_lines: Vec::new(),
-            mcus: BTreeMap::new(),
+            printers: BTreeMap::new(),
         };
-        if let Some(board) = board {
-            uses.add_boot(computer, board);
-        }
+        uses.add_boot(computer);
         // The number of uses is limited, so those that count most come first.
         if let Some((path, mcu)) = also {
             uses.add_host(computer, path, mcu);
@@ -149,7 +160,7 @@ impl Uses {
     /// Adds a klippy's configuration, and those of the services beside it.
     fn add_host(&mut self, computer: &Computer, path: &Path, mcu: Option<&str>) {
         match Printer::read(computer, path) {
-            Ok(printer) => self.add_printer(computer, path, &printer, mcu),
+            Ok(printer) => self.add_printer(computer, path, printer, mcu),
             Err(_) => self.add(Use {
                 what: Resource::Unknown(path.display().to_string()),
                 user: "unreadable configuration".to_owned(),
@@ -168,10 +179,9 @@ impl Uses {
     }
 
     /// Adds what a configuration uses on this computer's MCUs.
-    fn add_printer(&mut self, computer: &Computer, path: &Path, printer: &Printer, named: Option<&str>) {
+    fn add_printer(&mut self, computer: &Computer, path: &Path, printer: Printer, named: Option<&str>) {
         let own = printer.own_mcus(computer, named);
         let source = Source::Printer(path.to_owned());
-        self.mcus.extend(own.keys().next().map(|name| (path.to_owned(), name.clone())));
         for section in printer.config.sections() {
             let user = format!("[{}]", section.name);
             let pins: Vec<_> = printer.pins_of(section).filter(|named| own.contains_key(&named.pin.chip)).collect();
@@ -223,6 +233,13 @@ impl Uses {
                 self.add_with_pins(Use { what, user: user.clone(), place, source: source.clone(), function: None });
             }
         }
+        self.printers.insert(path.to_owned(), (printer, own));
+    }
+
+    /// The section of printer.cfg that is a user.
+    pub(in crate::cli) fn section(&self, one: &Use) -> Option<&Section> {
+        let Source::Printer(path) = &one.source else { return None };
+        self.printers.get(path)?.0.config.section(one.user.strip_prefix('[')?.strip_suffix(']')?)
     }
 
     /// Adds a use, and the lines that its bus has on the header.

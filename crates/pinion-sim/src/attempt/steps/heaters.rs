@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! All heaters get warm, and cool again when they are off.
 
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use pinion_printer_config::Limit;
 use serde_json::Value;
@@ -71,17 +70,17 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     };
     let hot = read(trial)?;
     trial.gcode("TURN_OFF_HEATERS", LONG)?;
-    let until = Instant::now() + HEAT;
+    let until = trial.host.now() + HEAT;
     loop {
         trial.still_ready()?;
         let now = read(trial)?;
         let still = hot.iter().zip(&now).position(|(hot, now)| *hot > 45.0 && hot - now < 2.0);
         match still {
             None => return Ok("all heaters are off, and cool".into()),
-            Some(n) if Instant::now() > until => {
+            Some(n) if trial.host.now() > until => {
                 return Err(trial.failed(format!("{} is off and does not cool", objects[n]), None));
             }
-            Some(_) => thread::sleep(Duration::from_millis(500)),
+            Some(_) => trial.host.sleep(Duration::from_millis(500)),
         }
     }
 }
@@ -98,7 +97,7 @@ fn heat(trial: &mut Trial<'_>, targets: &[(String, f64)]) -> Result<(), Outcome>
     for (name, target) in targets {
         trial.gcode(&format!("SET_HEATER_TEMPERATURE HEATER={} TARGET={target}", own_name(name)), LONG)?;
     }
-    let until = Instant::now() + HEAT;
+    let until = trial.host.now() + HEAT;
     let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
     loop {
         let status = match trial.host.query(&objects) {
@@ -108,11 +107,11 @@ fn heat(trial: &mut Trial<'_>, targets: &[(String, f64)]) -> Result<(), Outcome>
         let cold = targets.iter().find(|(name, target)| (celsius(&status, name) - target).abs() > NEAR_K);
         let Some((name, target)) = cold else { return Ok(()) };
         trial.still_ready()?;
-        if Instant::now() > until {
+        if trial.host.now() > until {
             let cause = format!("{name} is at {:.0} of {target} C", celsius(&status, name));
             return Err(trial.failed(cause, trial.place(name)));
         }
-        thread::sleep(Duration::from_millis(500));
+        trial.host.sleep(Duration::from_millis(500));
     }
 }
 

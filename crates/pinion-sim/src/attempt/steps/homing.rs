@@ -29,8 +29,8 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
     let is_said = |axis: usize| start[axis] == nozzle[axis] && has_said_place(trial, axis);
     // A probe that homes z finds the bed within its own distance of a step, and a mesh may be in force.
     let off = coordinates(&toolhead["position"]).into_iter().zip(nozzle).map(|(klippys, real)| (klippys - real).abs());
-    let far = off.enumerate().find(|(axis, off)| *off > NEAR_MM && !is_said(*axis));
-    if let Some((axis, off)) = far.filter(|_| is_plain(trial)) {
+    let mut far = off.enumerate().filter(|(axis, off)| *off > NEAR_MM && !is_said(*axis));
+    if let Some((axis, off)) = far.find(|(axis, _)| is_plain(trial, *axis)) {
         let axis = AXES[axis];
         let section = trial.config().section(&format!("stepper_{axis}"));
         let place = section.map(|section| section.place_of("position_endstop").clone());
@@ -57,11 +57,13 @@ fn has_said_place(trial: &Trial<'_>, axis: usize) -> bool {
     over.is_some_and(|over| over.text(&format!("set_position_{}", AXES[axis])).is_some())
 }
 
-/// Whether klippy's position is the nozzle's: nothing is between them, and the bed does not change it.
-fn is_plain(trial: &Trial<'_>) -> bool {
-    let sections = ["bed_tilt", "skew_correction", "axis_twist_compensation", "z_tilt", "quad_gantry_level"];
+/// Whether klippy's position along an axis is the nozzle's: nothing is between them, and the bed does not change it.
+fn is_plain(trial: &Trial<'_>, axis: usize) -> bool {
+    let of_z = ["bed_tilt", "axis_twist_compensation", "z_tilt", "z_tilt_ng", "quad_gantry_level"];
+    let has = |name: &&str| trial.config().section(name).is_some();
     let simple = ["cartesian", "corexy", "corexz", "delta", "hybrid_corexy", "hybrid_corexz"];
-    !sections.iter().any(|name| trial.config().section(name).is_some())
+    !has(&"skew_correction")
+        && !(axis == 2 && of_z.iter().any(has))
         && trial.kinematics().is_some_and(|kinematics| simple.contains(&kinematics))
 }
 

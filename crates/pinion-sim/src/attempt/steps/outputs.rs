@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Fans, lights and servos do what a command says.
 
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, SOON, Trial};
@@ -21,13 +20,13 @@ pub(super) fn fans(trial: &mut Trial<'_>) -> Seen {
     }
     for (name, on, off) in &fans {
         trial.gcode(on, LONG)?;
-        let until = Instant::now() + SOON;
+        let until = trial.host.now() + SOON;
         while trial.probe.fan(name).is_some_and(|fan| fan.rpm < 500.0) {
-            if Instant::now() > until {
+            if trial.host.now() > until {
                 let place = trial.place(name).or_else(|| trial.place(&format!("fan_generic {name}")));
                 return Err(trial.failed(format!("{on}: the fan stands still"), place));
             }
-            thread::sleep(Duration::from_millis(50));
+            trial.host.sleep(Duration::from_millis(50));
         }
         trial.gcode(off, LONG)?;
     }

@@ -2,8 +2,6 @@
 //! A print, and the path of the nozzle against the file.
 
 use std::io::BufReader;
-use std::sync::mpsc::{self, RecvTimeoutError};
-use std::thread;
 use std::time::Duration;
 
 use pinion::cli::files;
@@ -12,7 +10,7 @@ use pinion_sim::{AskedPath, PathPoint, Recorder, compare};
 
 use super::heaters::heat_extruder;
 use super::homing::said_mm;
-use super::square::square;
+use super::square::{LAYER_MM, square};
 use super::{Seen, skipped};
 use crate::attempt::host::Refused;
 use crate::attempt::report::Outcome;
@@ -22,6 +20,8 @@ use crate::attempt::trial::{LONG, Trial, travel};
 const PRINT: Duration = Duration::from_secs(4 * 3600);
 /// Longest G-code file.
 const GCODE_MIB: u64 = 256;
+/// How far apart two layers may be beside what the square asks for.
+const LAYER_OFF_MM: f64 = 0.05;
 /// Distance above which a print is wrong.
 const WITHIN_MM: f64 = 0.1;
 
@@ -66,7 +66,33 @@ pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
     if let Some(line) = found.ends_at_line {
         return Err(trial.failed(format!("{name}: the path ends at line {line}"), None));
     }
+    if trial.attempt.gcode.is_none() {
+        layers_are_apart(trial, &points)?;
+    }
     Ok(format!("{name}: {:.0} mm, at most {mm:.3} mm off", found.all.length_mm))
+}
+
+/// Fails if the two layers of the small square are not as far apart as it asks for. A mesh moves both alike.
+fn layers_are_apart(trial: &Trial<'_>, points: &[PathPoint]) -> Result<(), Outcome> {
+    let laid: f64 = points.iter().map(|point| f64::from(point.laid_mm)).sum();
+    // Of both layers: the sum of the heights by the filament that was laid there, and that filament.
+    let mut layers = [(0.0, 0.0); 2];
+    let mut so_far = 0.0;
+    for point in points {
+        let here = f64::from(point.laid_mm);
+        let (sum, filament) = &mut layers[usize::from(so_far + here / 2.0 > laid / 2.0)];
+        *sum += point.nozzle_mm[2] * here;
+        *filament += here;
+        so_far += here;
+    }
+    let [low, high] = layers.map(|(sum, filament)| sum / filament);
+    let apart = high - low;
+    if (apart - LAYER_MM).abs() > LAYER_OFF_MM {
+        let cause = format!("the layers of the square are {apart:.3} mm apart, not {LAYER_MM:.3} mm");
+        let section = trial.config().section("stepper_z");
+        return Err(trial.failed(cause, section.map(|section| section.place_of("rotation_distance").clone())));
+    }
+    Ok(())
 }
 
 /// Homes and heats for the small square. A file of the user does that itself.
@@ -87,24 +113,15 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.
 fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
-    let (stop, stopped) = mpsc::channel::<()>();
-    let mut recorder = trial.probe.recorder();
-    let watched = trial.probe.clone();
-    let recording = thread::spawn(move || {
-        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
-            recorder.read(watched.now());
-        }
-        let late = u64::from(Ticks::from_ms(450).0);
-        recorder.read(Clock::from_ticks(watched.now().ticks() + late));
-        recorder
-    });
+    trial.host.recorder = Some(trial.probe.recorder());
     let printed = print(trial);
-    thread::sleep(Duration::from_millis(600));
-    drop(stop);
-    match recording.join() {
-        Ok(recorder) => Ok((printed, recorder)),
-        Err(_) => Err(trial.failed("the path was not recorded", None)),
-    }
+    trial.host.sleep(Duration::from_millis(600));
+    let Some(mut recorder) = trial.host.recorder.take() else {
+        return Err(trial.failed("the path was not recorded", None));
+    };
+    // After a moment without a step the path ends.
+    recorder.read(Clock::from_ticks(trial.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
+    Ok((printed, recorder))
 }
 
 /// Sends a block of a file.

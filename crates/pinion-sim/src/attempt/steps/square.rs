@@ -5,6 +5,8 @@ use std::fmt::Write as _;
 
 /// Half a side of the square, if the bed is larger than that.
 const HALF_MM: f64 = 10.0;
+/// How far apart the layers are.
+pub(super) const LAYER_MM: f64 = 0.2;
 /// Filament for each millimeter of a line.
 const FEED: f64 = 0.033;
 
@@ -15,7 +17,7 @@ pub(super) fn square(low: [f64; 3], high: [f64; 3]) -> String {
     let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0)];
     let place = |(x, y): (f64, f64)| (middle[0] + x * half, middle[1] + y * half);
     let mut text = "G90\nM83\nG92 E0\n".to_owned();
-    for z in [0.3, 0.5] {
+    for z in [0.3, 0.3 + LAYER_MM] {
         let z = z + low[2].max(0.0);
         let (x, y) = place(corners[0]);
         // Writing to a String cannot fail.

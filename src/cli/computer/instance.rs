@@ -3,22 +3,23 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::computer::running::{Running, named_config};
-use crate::cli::computer::units::{self, setting};
-use crate::cli::computer::{Computer, Who};
 use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
 use crate::cli::run_args;
-use crate::cli::settings::{Given, Settings};
+use crate::cli::settings::{BoardName, Given, Settings};
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::{HOST_PATHS, is_host_path};
+
+use super::running::{Running, named_config};
+use super::units::{self, setting};
+use super::{Computer, Who};
 
 /// The unit of the usual instance.
 const UNIT: &str = "pinion-mcu";
 /// The configuration that the package delivers.
 const DELIVERED: &str = "/usr/share/pinion-mcu/pinion.toml";
 /// The unit that makes this link: the reverse of [`Files`].
-pub(super) fn unit_for(link: &Path) -> String {
+pub(in crate::cli) fn unit_for(link: &Path) -> String {
     match link.to_string_lossy().strip_prefix(HOST_PATHS) {
         None | Some("mcu") => UNIT.to_owned(),
         Some(name) => format!("{UNIT}@{name}"),
@@ -26,16 +27,16 @@ pub(super) fn unit_for(link: &Path) -> String {
 }
 
 /// A Pinion that runs, or that will run.
-pub(super) struct Instance {
+pub(in crate::cli) struct Instance {
     /// The unit that starts it, without `.service`. `None` if it was started by hand.
-    pub(super) unit: Option<String>,
+    pub(in crate::cli) unit: Option<String>,
     /// Its process, if it runs.
-    pub(super) pid: Option<u32>,
+    pub(in crate::cli) pid: Option<u32>,
     /// The configuration file that it reads, if any.
     config: Option<String>,
-    pub(super) settings: Settings,
+    pub(in crate::cli) settings: Settings,
     /// Where klippy finds it. `None` if klippy does not find it.
-    pub(super) link: Option<PathBuf>,
+    pub(in crate::cli) link: Option<PathBuf>,
 }
 
 /// The names of the files that belong to a unit.
@@ -66,7 +67,7 @@ impl Files {
 
 impl Instance {
     /// Its name for people.
-    pub(super) fn name(&self) -> String {
+    pub(in crate::cli) fn name(&self) -> String {
         match (&self.unit, self.pid) {
             (Some(unit), _) => unit.clone(),
             (None, Some(pid)) => format!("process {pid}"),
@@ -74,8 +75,13 @@ impl Instance {
         }
     }
 
+    /// Whether klippy finds this computer's own pins at a link of this path.
+    pub(in crate::cli) fn serves(&self, link: &Path) -> bool {
+        self.settings.board == BoardName::Linux && self.link.as_deref() == Some(link)
+    }
+
     /// How to restart it.
-    pub(super) fn restart(&self) -> String {
+    pub(in crate::cli) fn restart(&self) -> String {
         match &self.unit {
             Some(unit) => format!("sudo systemctl restart {}", word(unit)),
             None => "start it anew".to_owned(),
@@ -83,7 +89,7 @@ impl Instance {
     }
 
     /// The user that it runs as, or will run as. `None` if unknown.
-    pub(super) fn user(&self, computer: &Computer) -> Option<Who> {
+    pub(in crate::cli) fn user(&self, computer: &Computer) -> Option<Who> {
         if let Some(who) = self.pid.and_then(|pid| computer.user_of(pid)) {
             return Some(who);
         }
@@ -98,14 +104,14 @@ impl Instance {
     }
 
     /// Where to change its settings.
-    pub(super) fn config(&self) -> &str {
+    pub(in crate::cli) fn config(&self) -> &str {
         self.config.as_deref().unwrap_or("its command line")
     }
 }
 
 /// All instances, or, if there are none, the one that the service would be. Also the errors in the files with their
 /// settings.
-pub(super) fn instances(computer: &Computer) -> (Vec<Instance>, Vec<Finding>) {
+pub(in crate::cli) fn instances(computer: &Computer) -> (Vec<Instance>, Vec<Finding>) {
     let running = computer.running();
     let mut units = units::enabled(computer, |unit| is_ours(computer, unit));
     units.retain(|unit| !running.iter().any(|running| running.unit.as_ref() == Some(unit)));
@@ -135,7 +141,7 @@ fn is_ours(computer: &Computer, unit: &str) -> bool {
 }
 
 /// Whether a unit starts Klipper's own program.
-pub(super) fn is_klipper_s(computer: &Computer, unit: &str) -> bool {
+pub(in crate::cli) fn is_klipper_s(computer: &Computer, unit: &str) -> bool {
     units::of_klipper_mcu(unit) && !is_ours(computer, unit)
 }
 
@@ -245,9 +251,9 @@ fn options(computer: &Computer, file: &str) -> Result<Given, String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::says;
     use super::*;
     use crate::cli::computer::tests::Tree;
+    use crate::cli::doctor::tests::says;
     use crate::cli::finding::Level::{Error, Ok};
     use std::fs;
 

@@ -1,0 +1,191 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The sections that klippy's copy is without: those of plugins that klippy does not have, and what hangs on them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use pinion_linux::foreign;
+use pinion_printer_config::{Config, Limit, Section, Trouble};
+
+use super::known::{is_numbered, lacks_module, motor_of, near};
+use super::sensors::is_known;
+
+/// The probes of plugins.
+const PROBES: [&str; 7] = ["beacon", "cartographer", "scanner", "idm", "probe_eddy_ng", "tool_probe", "btt_eddy"];
+/// The sections that make klippy's own probe.
+const OWN_PROBES: [&str; 5] = ["probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe"];
+/// The steppers of klippy's kinematics, without their numbers.
+const STEPPERS: [&str; 10] = ["x", "y", "z", "a", "b", "c", "left", "right", "bed", "arm"];
+/// The height of a stand-in above the nozzle, if the plugin's section has no `z_offset`.
+const Z_OFFSET_MM: f64 = 1.0;
+/// The pin of a stand-in, on the main MCU.
+pub(super) const PIN: &str = "pinion_stand_in";
+/// Longest source of klippy.
+const SOURCE_MAX: u64 = 4 << 20;
+
+/// What a copy is without.
+#[derive(Clone, Debug, Default)]
+pub(super) struct LeftOut {
+    /// The whole names of the sections.
+    pub(super) sections: Vec<String>,
+    pub(super) stand_in: Option<StandIn>,
+}
+
+/// A plain probe in the place of a plugin's.
+#[derive(Clone, Debug)]
+pub(super) struct StandIn {
+    /// The plugin's section.
+    pub(super) section: String,
+    /// The offsets from the nozzle along x, y and z.
+    pub(super) offsets_mm: [f64; 3],
+}
+
+impl StandIn {
+    /// Its section of printer.cfg.
+    pub(super) fn text(&self) -> String {
+        let [x, y, z] = self.offsets_mm;
+        format!("[probe]\npin: {PIN}\nx_offset: {x}\ny_offset: {y}\nz_offset: {z}")
+    }
+}
+
+impl LeftOut {
+    /// What klippy's copy of a configuration has to be without. `klipper` is the checkout, if it is known.
+    ///
+    /// # Errors
+    ///
+    /// The offsets of a plugin's probe are no numbers.
+    pub(super) fn of(config: &Config, klipper: Option<&Path>) -> Result<LeftOut, Trouble> {
+        // A misspelled section is no plugin's: klippy refuses it.
+        let is_plugins = |section: &Section| lacks_module(section.kind(), klipper) && near(section.kind()).is_none();
+        let all = config.sections();
+        let is_without_pin = |section: &Section| section.text("pin").is_none() && section.name == "probe";
+        let has_own_probe = all.iter().any(|section| OWN_PROBES.contains(&section.kind()) && !is_without_pin(section));
+        let probe = all.iter().find(|section| is_plugins(section) && PROBES.contains(&section.kind()));
+        let probe = probe.filter(|_| !has_own_probe);
+        let has_plugin = all.iter().any(is_plugins);
+        let has_known_sensor =
+            |section: &Section| section.text("sensor_type").is_none_or(|named| is_known(config, named));
+        let sources = klipper.filter(|_| has_plugin).map(sources).unwrap_or_default();
+        let is_out = |section: &&Section| {
+            let kind = section.kind();
+            let motor = motor_of(section);
+            let is_of_none =
+                |motor: &str| config.section(motor).is_none_or(|motor| is_plugins(motor) || !is_axis(motor.kind()));
+            let renames = || {
+                section.text("rename_existing").is_some()
+                    && !has_command(&sources, section.own_name().unwrap_or_default())
+            };
+            is_plugins(section)
+                || !is_axis(kind)
+                || kind.starts_with("tmc") && is_of_none(motor)
+                // SAVE_CONFIG leaves the offset of a plugin's probe there.
+                || is_without_pin(section) && probe.is_some()
+                || kind == "gcode_macro" && !sources.is_empty() && renames()
+                // A plugin may have the sensor. A heater needs it, so it stays, and klippy says so.
+                || kind == "temperature_sensor" && has_plugin && !has_known_sensor(section)
+        };
+        let sections = all.iter().filter(is_out).map(|section| section.name.clone()).collect();
+        let saved = config.section("probe");
+        let stand_in = |section: &Section| {
+            let offset = |key: &str, usual: f64| {
+                let own = section.number(key, Limit::Any)?;
+                let saved = saved.map(|saved| saved.number(key, Limit::Any)).transpose()?.flatten();
+                Ok::<f64, Trouble>(own.or(saved).unwrap_or(usual))
+            };
+            let offsets_mm = [offset("x_offset", 0.0)?, offset("y_offset", 0.0)?, offset("z_offset", Z_OFFSET_MM)?];
+            Ok::<StandIn, Trouble>(StandIn { section: section.name.clone(), offsets_mm })
+        };
+        Ok(LeftOut { sections, stand_in: probe.map(stand_in).transpose()? })
+    }
+}
+
+/// Whether this is no stepper, or one of klippy's kinematics. A plugin may have others: `[stepper_mmu_gear]`.
+fn is_axis(kind: &str) -> bool {
+    let Some(axis) = kind.strip_prefix("stepper_") else { return true };
+    STEPPERS.iter().any(|own| is_numbered(axis, own)) || axis.len() == 1
+}
+
+/// klippy's sources.
+fn sources(klipper: &Path) -> Vec<String> {
+    let klippy = klipper.join("klippy");
+    let names = |folder: &Path| -> Vec<PathBuf> {
+        fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect()
+    };
+    let within = ["extras", "kinematics", "plugins"].iter().flat_map(|folder| names(&klippy.join(folder)));
+    let files = names(&klippy).into_iter().chain(within).filter(|path| path.extension().is_some_and(|end| end == "py"));
+    let text = |path: PathBuf| Some(String::from_utf8_lossy(&foreign::read(&path, SOURCE_MAX).ok()?).into_owned());
+    files.filter_map(text).collect()
+}
+
+/// Whether klippy has this command.
+fn has_command(sources: &[String], command: &str) -> bool {
+    let command = command.to_uppercase();
+    let forms = [format!("\"{command}\""), format!("'{command}'"), format!("cmd_{command}")];
+    sources.iter().any(|source| forms.iter().any(|form| source.contains(form)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SAVED: &str = "\n#*# <---------------------- SAVE_CONFIG ---------------------->\n\
+                         #*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.\n#*#\n";
+
+    fn left_out(text: &str, klipper: Option<&Path>) -> (Vec<String>, Option<StandIn>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("printer.cfg");
+        fs::write(&path, text).unwrap();
+        let LeftOut { sections, stand_in } = LeftOut::of(&Config::read(&path).unwrap(), klipper).unwrap();
+        (sections, stand_in)
+    }
+
+    #[test]
+    fn a_plain_probe_takes_the_place_of_a_plugin_s() {
+        for kind in PROBES {
+            let text =
+                format!("[{kind}]\ny_offset: 20\n[bed_mesh]\nmesh_min: 1, 1\n{SAVED}#*# [probe]\n#*# z_offset = 1.2\n");
+            let (sections, stand_in) = left_out(&text, None);
+            let stand_in = stand_in.unwrap();
+            assert_eq!(sections, [kind, "probe"]);
+            assert_eq!((stand_in.section.as_str(), stand_in.offsets_mm), (kind, [0.0, 20.0, 1.2]));
+            assert_eq!(stand_in.text(), "[probe]\npin: pinion_stand_in\nx_offset: 0\ny_offset: 20\nz_offset: 1.2");
+        }
+        let (sections, stand_in) = left_out("[beacon]\nserial: x\n[probe]\npin: PA1\nz_offset: 1\n", None);
+        assert_eq!((sections, stand_in.is_none()), (vec!["beacon".to_owned()], true), "it has one");
+    }
+
+    #[test]
+    fn what_hangs_on_a_plugin_goes_with_it() {
+        let text = "[mmu_machine]\n[stepper_mmu_gear]\nstep_pin: PD0\n[tmc2209 stepper_mmu_gear]\nuart_pin: PD4\n\
+                    [AFC_stepper lane1]\nstep_pin: PD1\n[tmc2209 AFC_stepper lane1]\nuart_pin: PD5\n[stepper_z1]\n\
+                    step_pin: PE1\n[tmc2209 stepper_z1]\nuart_pin: PE2\n[temperature_sensor a]\nsensor_type: AHT2X_TCA\n\
+                    [temperature_sensor b]\nsensor_type: AHT2X\n";
+        let expected = [
+            "mmu_machine",
+            "stepper_mmu_gear",
+            "tmc2209 stepper_mmu_gear",
+            "AFC_stepper lane1",
+            "tmc2209 AFC_stepper lane1",
+            "temperature_sensor a",
+        ];
+        assert_eq!(left_out(text, None).0, expected);
+    }
+
+    #[test]
+    fn a_misspelled_section_stays() {
+        assert_eq!(left_out("[heater_fann hotend]\npin: PA1\n[shaketune]\n", None).0, ["shaketune"]);
+    }
+
+    #[test]
+    fn a_macro_that_renames_a_command_of_a_plugin_goes_too() {
+        let klipper = tempfile::tempdir().unwrap();
+        let extras = klipper.path().join("klippy/extras");
+        fs::create_dir_all(&extras).unwrap();
+        fs::write(extras.join("gcode_macro.py"), "").unwrap();
+        fs::write(extras.join("homing.py"), "gcode.register_command('G28', self.cmd_G28)\n").unwrap();
+        let text = "[z_calib_plugin]\n[gcode_macro CALIBRATE_Z]\nrename_existing: BASE_Z\ngcode: BASE_Z\n\
+                    [gcode_macro G28]\nrename_existing: G28.1\ngcode: G28.1\n[gcode_macro X]\ngcode: G28\n";
+        assert_eq!(left_out(text, Some(klipper.path())).0, ["z_calib_plugin", "gcode_macro CALIBRATE_Z"]);
+        assert_eq!(left_out(text, None).0, ["z_calib_plugin"], "nobody knows the commands");
+    }
+}
