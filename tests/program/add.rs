@@ -16,7 +16,7 @@ use pinion_testkit::here;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::process::{output, pinion_path, program};
+use crate::process::{output, pinion_path};
 
 pub(crate) const PRINTER: &str = "home/pi/printer_data/config/printer.cfg";
 pub(crate) const PRINTER_CFG: &str = "# my printer\n[include mainsail.cfg]\n\n[printer]\nkinematics: corexy\n[stepper_x]\nposition_max: 300\n\
@@ -627,7 +627,8 @@ const OLD_CHANGES: [i64; 2] = [libc::SYS_rename, libc::SYS_unlink];
 #[cfg(not(target_arch = "x86_64"))]
 const OLD_CHANGES: [i64; 0] = [];
 
-/// Runs `pinion` and kills it before this change. False if it ends before.
+/// Runs `pinion` and kills it before this change. False if it ends before: waitpid(2) has taken it then.
+#[allow(clippy::zombie_processes)]
 fn is_killed_before(change: usize, arguments: &[String]) -> bool {
     // It begins when it is traced.
     let mut begin = Command::new("sh");
