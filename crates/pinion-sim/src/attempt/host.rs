@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::fmt::{self, Display};
 use std::fs::File;
 use std::io::{Read, Write};
+use std::os::fd::AsRawFd as _;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
@@ -14,6 +15,7 @@ use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use nix::fcntl::{FcntlArg, FdFlag, fcntl};
 use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
@@ -150,11 +152,18 @@ impl Host {
             Time::One(clock) => {
                 let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
                 // What follows env, and nothing before it, has the library.
-                command.arg("env").arg(format!("LD_PRELOAD={}", library()?.display()));
+                let library = library()?;
+                let opened = File::open(&library).and_then(|file| {
+                    fcntl(&file, FcntlArg::F_SETFD(FdFlag::empty()))?;
+                    Ok(file)
+                });
+                let file = opened.map_err(|error| failed(format!("{}: {error}", library.display())))?;
+                // By its descriptor: the loader takes a space or a colon in a path for the end of it.
+                command.arg("env").arg(format!("LD_PRELOAD=/proc/self/fd/{}", file.as_raw_fd()));
                 command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, &folder.path)));
                 // The same order of names in each run; one thread for numpy.
                 command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
-                Some((ours, theirs))
+                Some((ours, theirs, file))
             }
         };
         command.arg(python).arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
@@ -166,7 +175,7 @@ impl Host {
             failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
         })?;
         running.0.store(child.id().cast_signed(), Ordering::SeqCst);
-        let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, _)| ours), &socket, folder);
+        let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, ..)| ours), &socket, folder);
         let api = opened.inspect_err(|_| {
             running.0.store(0, Ordering::SeqCst);
             let _ = child.kill();

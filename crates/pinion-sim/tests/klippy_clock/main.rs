@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The library that gives klippy the printer's clock, in this computer's Python. Here the test is the printer.
 
+use std::fs;
 use std::io::{Read, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
@@ -8,14 +9,20 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+use tempfile::TempDir;
 
 /// The printer's time at the start.
 const START_NS: u64 = 1_000_000_000_000;
 /// A wait without an end.
 const NEVER: u64 = u64::MAX;
 
-fn library() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_pinion-sim")).with_file_name("deps/libpinion_clock.so")
+/// A folder with the library. The loader takes a space in the path of a target folder for the end of it.
+fn library() -> (TempDir, PathBuf) {
+    let built = Path::new(env!("CARGO_BIN_EXE_pinion-sim")).with_file_name("deps/libpinion_clock.so");
+    let folder = tempfile::tempdir().unwrap();
+    let library = folder.path().join("clock.so");
+    fs::copy(built, &library).unwrap();
+    (folder, library)
 }
 
 /// A program with the library, and the printer's end of its turns.
@@ -24,21 +31,23 @@ struct Player {
     socket: UnixStream,
     now_ns: u64,
     turns: u64,
+    _folder: TempDir,
 }
 
 impl Player {
     fn start(program: &str, arguments: &[&str]) -> Player {
         let (socket, theirs) = UnixStream::pair().unwrap();
         fcntl(&theirs, FcntlArg::F_SETFD(FdFlag::empty())).unwrap();
+        let (folder, library) = library();
         let child = Command::new(program)
             .args(arguments)
-            .env("LD_PRELOAD", library())
+            .env("LD_PRELOAD", library)
             .env("PINION_CLOCK", format!("{}:0:/nonexistent", theirs.as_raw_fd()))
             .env("PYTHONHASHSEED", "0")
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        Player { child, socket, now_ns: START_NS, turns: 0 }
+        Player { child, socket, now_ns: START_NS, turns: 0, _folder: folder }
     }
 
     /// The next two words, or nothing after its end.
@@ -110,6 +119,7 @@ fn a_program_whose_printer_is_gone_ends() {
 #[test]
 fn a_program_without_a_printer_has_the_computers_clock() {
     let script = "import time, threading\nthreading.Event().wait(0.01)\nprint(time.time() > 1.7e9, time.monotonic())";
-    let done = Command::new("python3").args(["-c", script]).env("LD_PRELOAD", library()).output().unwrap();
+    let (_folder, library) = library();
+    let done = Command::new("python3").args(["-c", script]).env("LD_PRELOAD", library).output().unwrap();
     assert!(String::from_utf8_lossy(&done.stdout).starts_with("True "), "{done:?}");
 }
