@@ -125,7 +125,11 @@ fn a_trial_that_root_starts_runs_klippy_without_rights_and_takes_it_along() {
     // In root's folder: it is made for the trial's user.
     let folder = root.path().join("sim");
     let mut trial = Command::new(&program);
-    trial.arg("sim").arg(&cfg).args(["--try", "--python", "/bin/sh", "--klipper"]).arg(root.path().join("klipper"));
+    trial
+        .arg("sim")
+        .arg(&cfg)
+        .args(["--try", "--real-time", "--python", "/bin/sh", "--klipper"])
+        .arg(root.path().join("klipper"));
     trial.arg("--folder").arg(&folder).env_remove("SUDO_UID").stdout(Stdio::null()).stderr(Stdio::null());
     let mut trial = Running(trial.spawn().unwrap());
     let who = wait::until_some(

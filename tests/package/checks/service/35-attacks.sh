@@ -61,7 +61,7 @@ cat /proc/self/status >$HOME_OF/who
 (echo words of klippy >$SECRET; cat $SECRET; kill -9 $before) >$HOME_OF/tried 2>&1
 exec sleep 600
 END
-pinion sim $HOME_OF/printer.cfg --try --python /bin/sh --klipper $HOME_OF/klipper >/run/trial 2>&1 &
+pinion sim $HOME_OF/printer.cfg --try --real-time --python /bin/sh --klipper $HOME_OF/klipper >/run/trial 2>&1 &
 trial=$!
 until_true 60 pgrep -u $AS -x sleep
 is "$(sed -n 's/^\(CapPrm\|CapEff\|CapAmb\|NoNewPrivs\):\t//p' $HOME_OF/who | sort -u | xargs)" '0000000000000000 1' "klippy's rights"
