@@ -13,10 +13,12 @@ use super::sensors::is_known;
 ///
 /// The first one that klippy refuses, too.
 pub(super) fn check(config: &Config) -> Result<(), Trouble> {
-    config.sections().iter().try_for_each(|section| checked(config, section))
+    // A plugin may have sensors and kinematics, too.
+    let has_plugin = config.sections().iter().any(|section| kind_of(section.kind()) == Kind::Strange);
+    config.sections().iter().try_for_each(|section| checked(config, section, has_plugin))
 }
 
-fn checked(config: &Config, section: &Section) -> Result<(), Trouble> {
+fn checked(config: &Config, section: &Section, has_plugin: bool) -> Result<(), Trouble> {
     let kind = section.kind();
     let refused = |key: &str, cause: String, remedy: &str| Err(section.trouble(key, cause).remedy(remedy));
     if kind_of(kind) == Kind::Strange
@@ -29,8 +31,6 @@ fn checked(config: &Config, section: &Section) -> Result<(), Trouble> {
         let cause = format!("Could not find config section '[{}]' required by tmc driver", motor_of(section));
         return refused("", cause, "add it, or remove the driver");
     }
-    // A plugin may have sensors and kinematics, too.
-    let has_plugin = config.sections().iter().any(|other| kind_of(other.kind()) == Kind::Strange);
     if let Some(sensor) = section
         .text("sensor_type")
         .filter(|sensor| section.text("min_temp").is_some() && !has_plugin && !is_known(config, sensor))

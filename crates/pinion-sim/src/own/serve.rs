@@ -14,7 +14,7 @@ use pinion_printer_config::copy::{self, Change};
 use pinion_printer_config::pins::MAIN;
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::is_host_path;
-use pinion_sim::{MCUS_MAX, SimConfig};
+use pinion_sim::SimConfig;
 use toml::{Table, Value};
 
 use super::plugins::{LeftOut, StandIn};
@@ -85,12 +85,6 @@ impl Own {
 
 fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translated), Trouble> {
     let mut config = Config::read(path)?;
-    // Before anything that looks at each of them.
-    let mcus = config.of_kind("mcu").count();
-    if mcus > MCUS_MAX {
-        let trouble = Trouble::new(format!("it has {mcus} MCUs, and at most {MCUS_MAX} are simulated"));
-        return Err(trouble.of(path.display()).remedy("leave some [mcu ...] out"));
-    }
     config.put_constants_in();
     if reading.is_checked {
         check(&config)?;
