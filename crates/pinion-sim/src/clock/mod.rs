@@ -187,6 +187,8 @@ impl OneClock {
         (self.player, self.has_stopped) = (None, false);
         self.mcus.iter_mut().for_each(BoardMcu::renew);
         let (ours, theirs) = UnixStream::pair()?;
+        ours.set_read_timeout(Some(LOOK))?;
+        ours.set_write_timeout(Some(LOOK))?;
         fcntl(&theirs, FcntlArg::F_SETFD(FdFlag::empty()))?;
         Ok((ours, theirs))
     }
@@ -307,7 +309,6 @@ impl OneClock {
         turn[8..].copy_from_slice(&u64::from(self.has_news).to_le_bytes());
         self.has_news = false;
         let given = turn;
-        let _ = player.socket.set_write_timeout(Some(LOOK));
         for hellos in 0.. {
             if hellos > HELLOS_MAX {
                 return Err(Stop::Ended);
@@ -332,7 +333,6 @@ impl OneClock {
     }
 
     fn receive(&self, mut socket: &UnixStream, bytes: &mut [u8; 16], until: Instant) -> Result<(), Stop> {
-        let _ = socket.set_read_timeout(Some(LOOK));
         let mut filled = 0;
         while filled < bytes.len() {
             match socket.read(&mut bytes[filled..]) {
