@@ -168,8 +168,7 @@ impl PathRecord {
         }
         let mut recorded = lock(&recorded);
         let now = probe.now();
-        // After a moment without a step the path ends.
-        recorded.recorder.read(Clock::from_ticks(now.ticks() + u64::from(LATE.0)));
+        recorded.recorder.end(now);
         recorded.rings.iter_mut().for_each(|ring| ring.read(now));
         let points = recorded.recorder.points();
         let mut page = Page::default();

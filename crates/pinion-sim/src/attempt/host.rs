@@ -188,14 +188,13 @@ impl Host {
         let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
         let running = running.clone();
         let (recorder, paces, progress, probe) = (None, None, Progress::new(attempt.form), probe.clone());
-        let next_id = 0;
         let mut host = Host {
             child,
             running,
             socket,
             api,
             buffer,
-            next_id,
+            next_id: 0,
             answers,
             said,
             time,
@@ -412,9 +411,12 @@ impl Host {
 
     /// All objects of klippy.
     pub(super) fn objects(&mut self) -> Result<Vec<String>, Refused> {
-        let answer = self.call("objects/list", json!({}), ANSWER)?;
-        let names = answer["objects"].as_array().cloned().unwrap_or_default();
-        Ok(names.iter().filter_map(Value::as_str).map(str::to_owned).collect())
+        Ok(texts(&self.call("objects/list", json!({}), ANSWER)?["objects"]))
+    }
+
+    /// The names of klippy's heaters.
+    pub(super) fn heaters(&mut self) -> Result<Vec<String>, Refused> {
+        Ok(texts(&self.query(&["heaters"])?["heaters"]["available_heaters"]))
     }
 
     /// Another connection, which stops the printer while a command runs.
@@ -482,6 +484,11 @@ impl Host {
         let _ = group();
         let _ = self.child.wait();
     }
+}
+
+/// The texts of a list.
+fn texts(list: &Value) -> Vec<String> {
+    list.as_array().into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
 }
 
 /// The library that gives klippy the printer's clock.

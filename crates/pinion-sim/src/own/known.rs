@@ -93,13 +93,15 @@ pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
     !is_built_in && !["extras", "plugins"].into_iter().any(has)
 }
 
+/// klippy's sections that make the probe, beside `[probe]`.
+pub(super) const MAKES_PROBE: [&str; 4] = ["bltouch", "load_cell_probe", "probe_eddy_current", "smart_effector"];
+
 /// Whether klippy loads nothing for this `[probe]`, because a section before it has made the probe. SAVE_CONFIG leaves such
 /// sections behind. A section of somebody's module may have made it.
 pub(super) fn is_left_over(config: &Config, section: &Section) -> bool {
-    const PROBES: [&str; 4] = ["bltouch", "load_cell_probe", "probe_eddy_current", "smart_effector"];
     let has_made_it = |other: &Section| {
         let is_strange = kind_of(other.kind()) == Kind::Strange && section.text("pin").is_none();
-        PROBES.contains(&other.kind()) || is_strange
+        MAKES_PROBE.contains(&other.kind()) || is_strange
     };
     section.name == "probe" && config.sections().iter().take_while(|other| other.name != "probe").any(has_made_it)
 }

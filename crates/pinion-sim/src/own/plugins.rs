@@ -7,13 +7,11 @@ use std::path::{Path, PathBuf};
 use pinion_linux::foreign;
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
-use super::known::{is_numbered, lacks_module, motor_of, near};
+use super::known::{MAKES_PROBE, is_numbered, lacks_module, motor_of, near};
 use super::sensors::is_known;
 
 /// The probes of plugins.
 const PROBES: [&str; 7] = ["beacon", "cartographer", "scanner", "idm", "probe_eddy_ng", "tool_probe", "btt_eddy"];
-/// The sections that make klippy's own probe.
-const OWN_PROBES: [&str; 5] = ["probe", "bltouch", "smart_effector", "probe_eddy_current", "load_cell_probe"];
 /// The steppers of klippy's kinematics, without their numbers.
 const STEPPERS: [&str; 10] = ["x", "y", "z", "a", "b", "c", "left", "right", "bed", "arm"];
 /// The height of a stand-in above the nozzle, if the plugin's section has no `z_offset`.
@@ -59,7 +57,8 @@ impl LeftOut {
         let is_plugins = |section: &Section| lacks_module(section.kind(), klipper) && near(section.kind()).is_none();
         let all = config.sections();
         let is_without_pin = |section: &Section| section.text("pin").is_none() && section.name == "probe";
-        let has_own_probe = all.iter().any(|section| OWN_PROBES.contains(&section.kind()) && !is_without_pin(section));
+        let makes_probe = |kind: &str| kind == "probe" || MAKES_PROBE.contains(&kind);
+        let has_own_probe = all.iter().any(|section| makes_probe(section.kind()) && !is_without_pin(section));
         let probe = all.iter().find(|section| is_plugins(section) && PROBES.contains(&section.kind()));
         let probe = probe.filter(|_| !has_own_probe);
         let has_plugin = all.iter().any(is_plugins);

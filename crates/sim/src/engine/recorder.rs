@@ -198,6 +198,11 @@ impl Recorder {
         }
     }
 
+    /// Ends the path: no step comes any more.
+    pub fn end(&mut self, now: Clock) {
+        self.read(now.later(u64::from(self.settles.0) + u64::from(REST.0) + 1));
+    }
+
     /// The path so far. It only grows. The line that the nozzle draws now is missing.
     pub fn points(&self) -> &[PathPoint] {
         &self.points

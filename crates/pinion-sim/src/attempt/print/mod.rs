@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use pinion::cli::files::Output;
 use pinion::cli::page::{Page, print};
-use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks};
+use pinion_firmware::time::CLOCK_FREQ;
 use pinion_printer_config::{Config, Trouble};
 use pinion_sim::{AskedPath, PathPoint, SimProbe, compare};
 use serde_json::{Value, json};
@@ -233,8 +233,7 @@ impl Print<'_> {
     /// The path that was recorded, and why it is not the whole one.
     fn path(&mut self) -> (Vec<PathPoint>, Option<String>) {
         let Some(mut recorder) = self.host.recorder.take() else { return (Vec::new(), None) };
-        // After a moment without a step the path ends.
-        recorder.read(Clock::from_ticks(self.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
+        recorder.end(self.probe.now());
         let trouble = match recorder.gaps() {
             _ if recorder.is_full() => Some("the path was too long, so its end is missing".to_owned()),
             0 => None,
@@ -245,10 +244,8 @@ impl Print<'_> {
 
     /// Starts the print, and follows it to its end. The error is why it stopped.
     fn follow(&mut self, began: Duration) -> Result<(), String> {
-        let status = self.host.query(&["heaters"]).map_err(|refused| refused.to_string())?;
-        let names = status["heaters"]["available_heaters"].as_array().cloned().unwrap_or_default();
-        let names = names.iter().filter_map(Value::as_str).map(str::to_owned);
-        self.heaters = names.map(Heated::new).collect();
+        let heaters = self.host.heaters().map_err(|refused| refused.to_string())?;
+        self.heaters = heaters.into_iter().map(Heated::new).collect();
         let start = format!("SDCARD_PRINT_FILE FILENAME={NAME}");
         self.host.gcode(&start, COMMAND).map_err(|refused| refused.to_string())?;
         let (mut still_since, mut last) = (self.host.now(), (0, [0.0; 3]));

@@ -17,9 +17,7 @@ const NEAR_K: f64 = 4.0;
 
 /// The heaters with klippy's name and a usual temperature of theirs.
 pub(super) fn targets(trial: &mut Trial<'_>) -> Vec<(String, f64)> {
-    let status = trial.host.query(&["heaters"]).unwrap_or_default();
-    let names = status["heaters"]["available_heaters"].as_array().cloned().unwrap_or_default();
-    let names = names.iter().filter_map(Value::as_str).map(str::to_owned);
+    let names = trial.host.heaters().unwrap_or_default();
     let target = |name: String| {
         let section = trial.config().section(&name)?;
         let number = |key| section.number(key, Limit::Any).ok().flatten();
@@ -33,7 +31,7 @@ pub(super) fn targets(trial: &mut Trial<'_>) -> Vec<(String, f64)> {
         };
         Some((name, usual.min(max - 10.0)))
     };
-    names.filter_map(target).collect()
+    names.into_iter().filter_map(target).collect()
 }
 
 pub(super) fn heated(trial: &mut Trial<'_>) -> Seen {

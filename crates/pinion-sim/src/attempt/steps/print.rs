@@ -5,7 +5,6 @@ use std::io::BufReader;
 use std::time::Duration;
 
 use pinion::cli::files;
-use pinion_firmware::time::{Clock, Ticks};
 use pinion_sim::{AskedPath, PathPoint, Recorder, compare};
 
 use super::heaters::heat_extruder;
@@ -119,8 +118,7 @@ fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -
     let Some(mut recorder) = trial.host.recorder.take() else {
         return Err(trial.failed("the path was not recorded", None));
     };
-    // After a moment without a step the path ends.
-    recorder.read(Clock::from_ticks(trial.probe.now().ticks() + u64::from(Ticks::from_ms(450).0)));
+    recorder.end(trial.probe.now());
     Ok((printed, recorder))
 }
 
