@@ -28,7 +28,7 @@ use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 
 use crate::attempt::time::Time;
-use crate::attempt::{self, Attempt, Form};
+use crate::attempt::{self, Attempt, Form, Task};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
 use crate::clock::{self, OneClock};
@@ -275,7 +275,9 @@ fn run_in_one_clock(
         camera.map_or(Ok(()), |camera| camera.start(probe.clone(), shown.clone()))?;
         let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
         let own = (&owner.own, owner.printer_cfg.as_path());
-        attempt.speed.iter().for_each(|speed| one.keep_pace(*speed));
+        if let Task::Serve(speed) = attempt.task {
+            one.keep_pace(speed);
+        }
         if let Some(trace) = spi_trace {
             probe.record_spi(trace.make()?);
         }
@@ -285,17 +287,15 @@ fn run_in_one_clock(
             record = Some(path);
         }
         let time = Time::One(Box::new(one));
-        let done = match &attempt.print {
-            Some(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
-            None if attempt.speed.is_some() => {
-                attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?
-            }
-            None => attempt::run(attempt, own, folder, &probe, time, &ended),
+        let done = match &attempt.task {
+            Task::Try => attempt::run(attempt, own, folder, &probe, time, &ended),
+            Task::Print(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
+            Task::Serve(_) => attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?,
         };
-        match done {
-            Some(passed) => Ok(passed),
-            None if attempt.print.is_some() || attempt.speed.is_some() => Err(alone(&attempt.python)),
-            None => Err(in_real_time(&attempt.python)),
+        match (done, &attempt.task) {
+            (Some(passed), _) => Ok(passed),
+            (None, Task::Try) => Err(in_real_time(&attempt.python)),
+            (None, Task::Print(_) | Task::Serve(_)) => Err(alone(&attempt.python)),
         }
     };
     match tried() {

@@ -11,6 +11,7 @@ mod steps;
 pub(crate) mod time;
 mod trial;
 
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -30,17 +31,25 @@ use steps::STEPS;
 use time::Time;
 use trial::Trial;
 
-/// The options of `--try`.
+/// What klippy does on the printer.
+#[derive(Clone, Debug)]
+pub(crate) enum Task {
+    /// What every owner does after a change (`--try`).
+    Try,
+    /// It prints a file (`--print`).
+    Print(PrintOptions),
+    /// It runs at this many times the pace of real time (`--speed`).
+    Serve(f64),
+}
+
+/// The options of `--try`, `--print` and `--speed`.
 #[derive(Clone, Debug)]
 pub(crate) struct Attempt {
+    pub(crate) task: Task,
     pub(crate) klipper: PathBuf,
     pub(crate) python: PathBuf,
     /// A file to print in place of the small one.
     pub(crate) gcode: Option<PathBuf>,
-    /// Let klippy run at this pace in place of the trial.
-    pub(crate) speed: Option<f64>,
-    /// Print a file in place of the trial.
-    pub(crate) print: Option<PrintOptions>,
     /// klippy and the printer have the computer's clock.
     pub(crate) real_time: bool,
     /// Only these steps, if there are any.
@@ -123,6 +132,11 @@ fn without_place(mistake: Trouble) -> (String, Option<Place>) {
     let Some((file, line)) = place else { return (mistake.to_string(), None) };
     let subject = Some(rest).filter(|rest| !rest.is_empty()).map(Box::from);
     (Trouble { subject, ..mistake }.to_string(), Some(Place { file: Path::new(file).into(), line }))
+}
+
+/// A file of the folder cannot be written.
+fn unwritten(path: &Path, error: io::Error) -> Trouble {
+    Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("free space")
 }
 
 /// The names of the steps, for the command line.

@@ -6,12 +6,13 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use pinion::cli::page::{Page, print};
+use pinion::cli::page::Page;
 use pinion_printer_config::Trouble;
 use pinion_sim::SimProbe;
 
 use super::Attempt;
 use super::host::{Host, NoStart};
+use super::report::show;
 use super::time::Time;
 use crate::clock::Stop;
 use crate::own::serve::Folder;
@@ -44,9 +45,7 @@ pub(crate) fn run(
     page.line(format_args!("klippy runs {}. Ctrl-C ends it.", printer.display()));
     page.line(format_args!("  its API, for Moonraker: {}", folder.path.join("klippy.sock").display()));
     page.line(format_args!("  its log: {}", folder.path.join("klippy.log").display()));
-    if let Err(error) = print(&page) {
-        log::warn!("{error}");
-    }
+    show(&page);
     while !ended.load(Ordering::SeqCst) {
         let passed = host.sleep(LOOK);
         if ended.load(Ordering::SeqCst) {

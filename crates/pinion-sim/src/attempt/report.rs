@@ -12,6 +12,13 @@ use pinion::cli::terminal::ERASE_LINE;
 use pinion_linux::foreign::plain;
 use pinion_printer_config::Place;
 
+/// Prints a page. What it says is also in the exit status, so a reader that is gone is no failure.
+pub(super) fn show(page: &Page) {
+    if let Err(error) = print(page) {
+        log::warn!("{error}");
+    }
+}
+
 /// How a step ended.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Outcome {
@@ -147,9 +154,7 @@ impl Report {
             let seconds = if result == "passed" { format!(" ({:.1} s)", took.as_secs_f64()) } else { String::new() };
             page.line(format_args!("{mark:<6}{name:<12} {place}{text}{seconds}"));
             self.erase();
-            if let Err(error) = print(&page) {
-                log::warn!("{error}");
-            }
+            show(&page);
         }
         self.steps.push(Step { name, outcome, took });
     }
@@ -201,9 +206,7 @@ impl Report {
                 page.line(format_args!("::error {at},title={}::{text}", step.name));
             }
         }
-        if let Err(error) = print(&page) {
-            log::warn!("{error}");
-        }
+        show(&page);
     }
 
     fn json(&self, printer: &Path, folder: Option<&Path>) -> Value {

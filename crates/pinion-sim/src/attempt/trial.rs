@@ -2,19 +2,17 @@
 //! A klippy on the user's configuration: its commands, its restarts, and what a step asks it and the printer.
 
 use std::fs;
-use std::io;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use pinion_printer_config::{Config, Place, Section, Trouble};
 use pinion_sim::{Recorder, SimProbe, write_svg};
 use serde_json::Value;
 
-use super::Attempt;
 use super::host::{Host, NoStart, Refused};
 use super::place::place_of;
 use super::report::Outcome;
 use super::steps::{Step, is_first};
+use super::{Attempt, unwritten};
 use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
 
@@ -57,19 +55,16 @@ impl<'a> Trial<'a> {
     /// Writes the camera's picture, and the path of the print, into the folder.
     pub(super) fn keep(&mut self) -> Result<(), Trouble> {
         let place = |name| self.folder.path.join(name);
-        let failed = |path: PathBuf, error: io::Error| {
-            Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("free space")
-        };
         if let Some(path) = &self.path {
             let file = place("path.svg");
             let mut drawing = Vec::new();
             let drawn = write_svg(path.points(), path.filament_step_mm(), &mut drawing);
-            drawn.and_then(|()| fs::write(&file, drawing)).map_err(|error| failed(file, error))?;
+            drawn.and_then(|()| fs::write(&file, drawing)).map_err(|error| unwritten(&file, error))?;
         }
         let path = self.path.take().unwrap_or_else(|| self.probe.recorder());
         if let Some(jpeg) = picture(&self.own.sim, self.probe, path) {
             let file = place("picture.jpg");
-            fs::write(&file, jpeg).map_err(|error| failed(file, error))?;
+            fs::write(&file, jpeg).map_err(|error| unwritten(&file, error))?;
         }
         Ok(())
     }

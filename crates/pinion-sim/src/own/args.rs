@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::Pace;
 use crate::attempt::print::PrintOptions;
-use crate::attempt::{self, Attempt, Form, Running};
+use crate::attempt::{self, Attempt, Form, Running, Task};
 use pinion_printer_config::Trouble;
 
 /// Options for a printer.cfg.
@@ -133,16 +133,15 @@ impl OwnArgs {
         }
         let klipper = attempt::klipper(self.klipper())?;
         let python = attempt::python(self.python.as_deref(), &klipper);
+        let print = |file: &PathBuf| {
+            Task::Print(PrintOptions { file: file.clone(), layers: self.layers, plot: self.plot.clone() })
+        };
+        let task = self.print.as_ref().map(print).or(self.speed.map(Task::Serve)).unwrap_or(Task::Try);
         Ok(Some(Attempt {
+            task,
             klipper,
             python,
             gcode: self.gcode.clone(),
-            print: self.print.as_ref().map(|file| PrintOptions {
-                file: file.clone(),
-                layers: self.layers,
-                plot: self.plot.clone(),
-            }),
-            speed: self.speed,
             real_time: self.real_time,
             only: self.only.clone(),
             form: self.form(),

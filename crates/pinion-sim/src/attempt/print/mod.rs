@@ -14,16 +14,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use pinion::cli::files::Output;
-use pinion::cli::page::{Page, print};
+use pinion::cli::page::Page;
 use pinion_firmware::time::CLOCK_FREQ;
 use pinion_printer_config::{Config, Trouble};
 use pinion_sim::{AskedPath, PathPoint, SimProbe, compare};
 use serde_json::{Value, json};
 
 use super::host::{Host, NoStart};
+use super::report::show;
 use super::time::Time;
 use super::trial::homes_by_stall;
-use super::{Attempt, Form};
+use super::{Attempt, Form, unwritten};
 use crate::own::serve::{Folder, Own};
 use file::GcodeFile;
 use phase::{Phase, Sight};
@@ -122,9 +123,7 @@ pub(crate) fn run(
         Form::Json => Page::json(&format!("{}\n", printed.json(printer, (took, &folder.path)))),
         Form::Lines => printed.page(printer, (took, options.layers)),
     };
-    if let Err(error) = print(&page) {
-        log::warn!("{error}");
-    }
+    show(&page);
     Ok(Some(printed.passed()))
 }
 
@@ -132,25 +131,20 @@ pub(crate) fn run(
 pub(crate) fn refused(printer: &Path, mistake: &Trouble) -> ExitCode {
     let stopped = json!({ "line": null, "text": null, "why": mistake.to_string() });
     let report = json!({ "printer": printer.display().to_string(), "passed": false, "stopped": stopped });
-    if let Err(error) = print(&Page::json(&format!("{report}\n"))) {
-        log::warn!("{error}");
-    }
+    show(&Page::json(&format!("{report}\n")));
     ExitCode::FAILURE
 }
 
 /// Puts the file where klippy looks for files to print.
 fn offer(file: &GcodeFile, own: &Own, folder: &Folder) -> Result<(), Trouble> {
-    let failed = |path: &Path, error: std::io::Error| {
-        Trouble::new(format!("it cannot be written: {error}")).of(path.display()).remedy("free space")
-    };
     let gcodes = folder.path.join("gcodes");
     let copy = gcodes.join(NAME);
-    fs::write(&copy, &file.bytes).map_err(|error| failed(&copy, error))?;
+    fs::write(&copy, &file.bytes).map_err(|error| unwritten(&copy, error))?;
     if own.config.section("virtual_sdcard").is_none() {
         // A printer whose host prints by another way.
-        let text = fs::read_to_string(&folder.printer_cfg).map_err(|error| failed(&folder.printer_cfg, error))?;
+        let text = fs::read_to_string(&folder.printer_cfg).map_err(|error| unwritten(&folder.printer_cfg, error))?;
         let text = format!("[virtual_sdcard]\npath: {}\n{text}", gcodes.display());
-        fs::write(&folder.printer_cfg, text).map_err(|error| failed(&folder.printer_cfg, error))?;
+        fs::write(&folder.printer_cfg, text).map_err(|error| unwritten(&folder.printer_cfg, error))?;
     }
     Ok(())
 }
