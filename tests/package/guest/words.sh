@@ -39,6 +39,31 @@ light() {
     until_true 5 is_high 3
 }
 dark() { pkill -f '/share/host light' || true; }
+sockets() { ls /run/pinion/*.sock /run/pinion/*.trace; }
+# hold COUNT SECONDS: klippy's user opens each socket so often, within that time, and keeps it open.
+hold() {
+    cat >/run/hold.py <<'END'
+import socket, sys, time
+held = []
+for path in sys.argv[2:]:
+    for _ in range(int(sys.argv[1])):
+        one = socket.socket(socket.AF_UNIX)
+        one.settimeout(5)
+        try:
+            one.connect(path)
+        except OSError:
+            pass
+        held.append(one)
+print("held", flush=True)
+time.sleep(600)
+END
+    klippy python3 /run/hold.py "$1" $(sockets) >/run/held &
+    until_true "$2" grep -q held /run/held
+}
+let_go() {
+    pkill -u klippy -f hold.py
+    rm /run/hold.py /run/held
+}
 # The newest recording. The heater's host is gone, so the MCU stops and leaves one.
 recording() { find /var/lib/pinion -name '*.trace' -newer /run/light | head -n 1; }
 leaves_recording() { [ -n "$(recording)" ]; }

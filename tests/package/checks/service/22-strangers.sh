@@ -26,7 +26,6 @@ wait || true
 rm /home/stranger/klippy.py $CONFIG /run/advice-*
 
 # A user outside of the group reaches neither the terminal nor the sockets, and plants nothing where the service writes.
-sockets() { ls /run/pinion/*.sock /run/pinion/*.trace; }
 is "$(sockets | wc -l)" 2 "the number of sockets"
 for file in $LINK $(sockets); do
     not setpriv --reuid=stranger --regid=stranger --init-groups test -w "$file"
@@ -47,28 +46,12 @@ END
 klippy python3 /run/spoil.py $LINK
 until_true 20 identifies $LINK HEATER
 # Members of the group hold each socket open many times. Root still reads the status, and a host is served.
-cat >/run/hold.py <<'END'
-import socket, sys, time
-held = []
-for path in sys.argv[1:]:
-    for _ in range(200):
-        one = socket.socket(socket.AF_UNIX)
-        one.settimeout(5)
-        try:
-            one.connect(path)
-        except OSError:
-            pass
-        held.append(one)
-print("held", flush=True)
-time.sleep(600)
-END
-klippy python3 /run/hold.py $(sockets) >/run/held &
-until_true 120 grep -q held /run/held
+hold 200 120
 pinion status >/run/status
 grep klipper_host_mcu /run/status
 identifies
 is "$(pid)" "$before" "the process"
-pkill -u klippy -f hold.py
+let_go
 wait || true
 # The link's place is taken before the start: by a link to a file of root's, ...
 evil='sudo-usermod-stranger'
@@ -111,7 +94,7 @@ pkill -u stranger
 wait || true
 until_true 30 is_active pinion-mcu
 identifies
-rm -r /tmp/x* $LINK.* /run/spoil.py /run/hold.py /run/squat.py /run/held /run/status /run/advice 2>/dev/null || true
+rm -r /tmp/x* $LINK.* /run/spoil.py /run/squat.py /run/status /run/advice 2>/dev/null || true
 
 search=$(pgrep -P "$(pid)" -x pinion-search)
 own() { setpriv --reuid=pinion --regid=pinion --clear-groups "$@"; }

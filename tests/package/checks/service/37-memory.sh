@@ -8,23 +8,7 @@ before=$(pid)
 score() { cat "/proc/$1/oom_score_adj"; }
 is "$(score "$before") $(score "$(guardian)") $(score "$(pgrep -P "$before" -x pinion-search)")" '-900 -1000 500' "the scores"
 # As many clients as it lets in, and recordings that nobody reads.
-cat >/run/hold.py <<'END'
-import glob, socket, time
-held = []
-for path in glob.glob("/run/pinion/*.sock") + glob.glob("/run/pinion/*.trace"):
-    for _ in range(100):
-        one = socket.socket(socket.AF_UNIX)
-        one.settimeout(5)
-        try:
-            one.connect(path)
-        except OSError:
-            pass
-        held.append(one)
-print("held", flush=True)
-time.sleep(600)
-END
-klippy python3 /run/hold.py >/run/held &
-until_true 60 grep -q held /run/held
+hold 100 60
 echo "with everything on: $(($(cat $GROUP/memory.peak 2>/dev/null || cat $GROUP/memory.current) / 1000000)) MB"
 [ "$(cat $GROUP/memory.current)" -lt 64000000 ]
 # Something in the service takes memory until the kernel kills a process. Then it gives a little back and pauses. The
@@ -65,5 +49,5 @@ identifies
 is_low 3
 # The guardian is never taken. (A line that nobody holds falls back to low here, so its log is the proof.)
 said | grep 'guardian: .* outputs are driven to their shutdown values'
-pkill -f hold.py
-rm /run/hold.py /run/held /run/fill.py
+let_go
+rm /run/fill.py
