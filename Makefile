@@ -95,7 +95,7 @@ mainsail: system-packages-mainsail build
 	@PINION='$(PINION)' scripts/mainsail '$(FOLDER)'
 
 build: system-packages-build
-	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-simulator
+	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-sim
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel

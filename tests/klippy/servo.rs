@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::checkout;
 use super::klippy::Printer;
-use pinion_sim::Look;
+use pinion_model::Look;
 
 /// The servo's angle, after it has stopped turning.
 fn servo_degrees(printer: &Printer) -> f64 {

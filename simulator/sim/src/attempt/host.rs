@@ -1,0 +1,554 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A klippy that this program starts, and its API server.
+
+use std::collections::HashMap;
+use std::fmt::{self, Display};
+use std::fs::File;
+use std::io::{Read, Write};
+use std::os::fd::AsRawFd as _;
+use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+use nix::sys::signal::{self, Signal};
+use nix::unistd::Pid;
+use serde_json::{Value, json};
+
+use super::report::Progress;
+use super::time::Time;
+use super::{Attempt, rights};
+use crate::clock::{self, LIBRARY, Stop};
+use crate::own::serve::Folder;
+use pinion_model::{PaceWatch, Recorder, SimProbe};
+use pinion_printer_config::Trouble;
+
+/// The end of a message.
+const END: u8 = 3;
+/// Highest number of lines of klippy's output that are kept.
+const SAID_MAX: usize = 10_000;
+/// Longest message.
+const MESSAGE_MAX: usize = 64 << 20;
+/// How long klippy has to open its API.
+const START: Duration = Duration::from_secs(60);
+/// How long klippy has to answer a question about its state.
+const ANSWER: Duration = Duration::from_secs(30);
+/// Time between two reads of klippy's state while a command runs.
+const LOOK: Duration = Duration::from_secs(5);
+/// How long klippy is left alone when it is ready, as people do. It fills its display then: homing in the first second would
+/// come behind that, too late.
+const FIRST_MOMENTS: Duration = Duration::from_secs(3);
+/// How long klippy has to end in order, in real time.
+const END_TIME: Duration = Duration::from_secs(3);
+/// Time between two looks at an API that is not there yet.
+const LOOK_FOR_API: Duration = Duration::from_millis(50);
+/// Time between two reads of the path. The printer keeps half a second of an axis at 32,000 steps per second.
+const READ_PATH: Duration = Duration::from_millis(50);
+
+/// The result of a command.
+#[derive(Debug)]
+pub(super) enum Refused {
+    /// klippy refused it, in its words.
+    Error(String),
+    /// It took too long.
+    Late,
+    /// klippy is gone.
+    Gone(String),
+}
+
+impl Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Refused::Error(words) => f.write_str(words),
+            Refused::Late => f.write_str("it takes too long"),
+            Refused::Gone(why) => write!(f, "klippy is gone: {why}"),
+        }
+    }
+}
+
+impl From<Stop> for Refused {
+    fn from(stop: Stop) -> Refused {
+        Refused::Gone(stop.to_string())
+    }
+}
+
+/// Why klippy did not start.
+pub(super) enum NoStart {
+    /// It takes no part in the printer's clock: its Python loads no library.
+    Alone,
+    /// Anything else.
+    Trouble(Trouble),
+}
+
+impl From<Trouble> for NoStart {
+    fn from(trouble: Trouble) -> NoStart {
+        NoStart::Trouble(trouble)
+    }
+}
+
+/// The number of the process that this program started, so that nothing of it stays when the program ends.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Running(Arc<AtomicI32>);
+
+impl Running {
+    /// Ends it, if it runs.
+    pub(crate) fn end(&self) {
+        // A process that nobody has waited for keeps its number.
+        let pid = self.0.swap(0, Ordering::SeqCst);
+        if pid != 0 {
+            let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
+        }
+    }
+}
+
+/// A klippy.
+pub(super) struct Host {
+    child: Child,
+    running: Running,
+    socket: PathBuf,
+    api: UnixStream,
+    buffer: Vec<u8>,
+    next_id: u64,
+    /// Answers to other questions than the one that is waited for.
+    answers: HashMap<u64, Value>,
+    /// klippy's output since the last command.
+    pub(super) said: Vec<String>,
+    pub(super) time: Time,
+    /// Records the nozzle's path while time passes.
+    pub(super) recorder: Option<Recorder>,
+    /// Watches how fast the motors are.
+    pub(super) paces: Option<PaceWatch>,
+    pub(super) progress: Progress,
+    probe: SimProbe,
+}
+
+impl Host {
+    /// Starts a klippy on the copy in a folder.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be started, does not take part in the clock, or opens no API.
+    pub(super) fn start(attempt: &Attempt, folder: &Folder, probe: &SimProbe, mut time: Time) -> Result<Host, NoStart> {
+        let Attempt { klipper, python, running, .. } = attempt;
+        let program = klipper.join("klippy/klippy.py");
+        let failed = |cause: String| Trouble::new(cause).of(program.display());
+        if !program.is_file() {
+            let trouble = failed("there is no klippy".into());
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR").into());
+        }
+        let socket = folder.path.join("klippy.sock");
+        let _ = std::fs::remove_file(&socket);
+        let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
+        let mut command = rights::confined();
+        let turns = match &mut time {
+            Time::Real(..) => None,
+            // The library is for 64 bits.
+            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
+            Time::One(clock) => {
+                let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
+                // What follows env, and nothing before it, has the library.
+                let library = library()?;
+                let opened = File::open(&library).and_then(|file| {
+                    fcntl(&file, FcntlArg::F_SETFD(FdFlag::empty()))?;
+                    Ok(file)
+                });
+                let file = opened.map_err(|error| failed(format!("{}: {error}", library.display())))?;
+                // By its descriptor: the loader takes a space or a colon in a path for the end of it.
+                command.arg("env").arg(format!("LD_PRELOAD=/proc/self/fd/{}", file.as_raw_fd()));
+                command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, &folder.path)));
+                // The same order of names in each run; one thread for numpy.
+                command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
+                Some((ours, theirs, file))
+            }
+        };
+        command.arg(python).arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
+        command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
+        command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
+        // A Ctrl-C ends this program, which ends klippy.
+        let started = command.stderr(output).process_group(0).spawn();
+        let mut child = started.map_err(|error| {
+            failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
+        })?;
+        running.0.store(child.id().cast_signed(), Ordering::SeqCst);
+        let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, ..)| ours), &socket, folder);
+        let api = opened.inspect_err(|_| {
+            running.0.store(0, Ordering::SeqCst);
+            let _ = child.kill();
+            let _ = child.wait();
+        });
+        let api = api.map_err(|error| match error {
+            NoStart::Trouble(trouble) => NoStart::Trouble(trouble.of(program.display())),
+            NoStart::Alone => NoStart::Alone,
+        })?;
+        let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
+        let running = running.clone();
+        let (recorder, paces, progress, probe) = (None, None, Progress::new(attempt.form), probe.clone());
+        let mut host = Host {
+            child,
+            running,
+            socket,
+            api,
+            buffer,
+            next_id: 0,
+            answers,
+            said,
+            time,
+            recorder,
+            paces,
+            progress,
+            probe,
+        };
+        let subscribed = host.subscribe();
+        match subscribed {
+            Ok(()) => Ok(host),
+            Err(refused) => Err(failed(format!("its API does not answer: {refused:?}")).into()),
+        }
+    }
+
+    /// Waits until klippy takes part in the clock and has opened its API.
+    fn await_api(
+        child: &mut Child,
+        time: &mut Time,
+        turns: Option<UnixStream>,
+        socket: &Path,
+        folder: &Folder,
+    ) -> Result<UnixStream, NoStart> {
+        if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
+            match clock.await_player(turns) {
+                Ok(()) => {}
+                Err(Stop::Computes) => return Err(NoStart::Alone),
+                Err(_) => return Err(no_start(&folder.path, true).into()),
+            }
+        }
+        let until = time.now() + START;
+        loop {
+            if let Ok(api) = UnixStream::connect(socket) {
+                return Ok(api);
+            }
+            let passed = time.sleep(LOOK_FOR_API);
+            let ended = passed.is_err() || child.try_wait().ok().flatten().is_some();
+            if ended || time.now() > until {
+                return Err(no_start(&folder.path, ended).into());
+            }
+        }
+    }
+
+    /// Gives the clock away, for another klippy.
+    pub(super) fn take_time(&mut self) -> Time {
+        std::mem::replace(&mut self.time, Time::Real(Instant::now(), Arc::default()))
+    }
+
+    /// klippy's process.
+    pub(super) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Whether klippy runs.
+    pub(super) fn is_there(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
+    pub(super) fn now(&self) -> Duration {
+        self.time.now()
+    }
+
+    /// Lets time pass.
+    ///
+    /// # Errors
+    ///
+    /// klippy takes no more turns.
+    pub(super) fn sleep(&mut self, span: Duration) -> Result<(), Stop> {
+        let until = self.now() + span;
+        while self.now() < until {
+            let next = until.min(self.now() + READ_PATH);
+            self.time.sleep(next.saturating_sub(self.now()))?;
+            self.look();
+        }
+        Ok(())
+    }
+
+    /// Does what has to be done now and then.
+    fn look(&mut self) {
+        let now = self.probe.now();
+        self.recorder.iter_mut().for_each(|recorder| recorder.read(now));
+        self.paces.iter_mut().for_each(|paces| paces.read(now));
+        self.progress.show(self.time.now());
+    }
+
+    /// Has klippy send its output.
+    fn subscribe(&mut self) -> Result<(), Refused> {
+        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
+    }
+
+    /// A call of the API.
+    pub(super) fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
+        let id = self.send(method, params)?;
+        self.answer(id, self.now() + limit)
+    }
+
+    /// Sends a question, and returns its number.
+    fn send(&mut self, method: &str, params: Value) -> Result<u64, Refused> {
+        self.next_id += 1;
+        let mut request = json!({ "id": self.next_id, "method": method, "params": params }).to_string().into_bytes();
+        request.push(END);
+        self.api.write_all(&request).map_err(|_| Refused::Gone(Stop::Ended.to_string()))?;
+        self.time.poke();
+        Ok(self.next_id)
+    }
+
+    /// Waits for the answer to a question.
+    fn answer(&mut self, id: u64, until: Duration) -> Result<Value, Refused> {
+        loop {
+            let message = match self.answers.remove(&id) {
+                Some(message) => message,
+                None => self.message(until)?,
+            };
+            if let Some(line) = message["params"]["response"].as_str()
+                && self.said.len() < SAID_MAX
+            {
+                self.said.push(line.to_owned());
+            }
+            match message["id"].as_u64() {
+                Some(other) if other == id => {
+                    return match &message["error"] {
+                        Value::Null => Ok(message["result"].clone()),
+                        error => {
+                            let words = error["message"].as_str().map_or_else(|| error.to_string(), str::to_owned);
+                            Err(Refused::Error(words))
+                        }
+                    };
+                }
+                Some(other) if other < id => _ = self.answers.insert(other, message),
+                _ => {}
+            }
+        }
+    }
+
+    fn message(&mut self, until: Duration) -> Result<Value, Refused> {
+        let mut piece = [0; 4096];
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == END) {
+                let message = serde_json::from_slice(&self.buffer[..end]).unwrap_or_default();
+                self.buffer.drain(..=end);
+                return Ok(message);
+            }
+            if self.now() >= until {
+                return Err(Refused::Late);
+            }
+            let next = until.min(self.now() + READ_PATH);
+            let is_there = self.time.await_bytes(&self.api, next)?;
+            self.look();
+            if !is_there {
+                continue;
+            }
+            let gone = |cause: &str| Refused::Gone(cause.to_owned());
+            match self.api.read(&mut piece) {
+                Ok(0) => return Err(Stop::Ended.into()),
+                Ok(read) => self.buffer.extend_from_slice(&piece[..read]),
+                Err(error) => return Err(gone(&error.to_string())),
+            }
+            if self.buffer.len() > MESSAGE_MAX {
+                return Err(gone("its message has no end"));
+            }
+        }
+    }
+
+    /// Runs G-code to its end. A klippy that stopped may never answer, so its state is read now and then.
+    pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
+        self.said.clear();
+        let id = self.send("gcode/script", json!({ "script": script }))?;
+        let until = self.now() + limit;
+        let mut stopped = None;
+        loop {
+            match self.answer(id, until.min(self.now() + LOOK)) {
+                Err(Refused::Late) if stopped.is_some() => return Err(Refused::Error(stopped.unwrap_or_default())),
+                Err(Refused::Late) if self.now() < until => {
+                    let (state, words) = self.state()?;
+                    stopped = (state != "ready").then_some(words);
+                }
+                answer => return answer.map(drop),
+            }
+        }
+    }
+
+    /// Waits until klippy is ready. The error is its words.
+    pub(super) fn until_ready(&mut self, limit: Duration) -> Result<(), String> {
+        let until = self.now() + limit;
+        loop {
+            match self.state() {
+                Ok((state, _)) if state == "ready" => {
+                    return self.sleep(FIRST_MOMENTS).map_err(|stop| stop.to_string());
+                }
+                Ok((state, words)) if state == "error" || state == "shutdown" => return Err(words),
+                Ok((_, words)) if self.now() > until => return Err(format!("klippy is not ready: {words}")),
+                Ok(_) => self.sleep(LOOK_FOR_API).map_err(|stop| stop.to_string())?,
+                // A klippy that finds its MCU shut down restarts both.
+                Err(Refused::Gone(_)) if self.now() < until && self.reconnect() => {}
+                Err(refused) => return Err(format!("klippy does not answer: {refused}")),
+            }
+        }
+    }
+
+    /// klippy's state and its words about it.
+    pub(super) fn state(&mut self) -> Result<(String, String), Refused> {
+        let info = self.call("info", json!({}), ANSWER)?;
+        let text = |key: &str| info[key].as_str().unwrap_or_default().to_owned();
+        Ok((text("state"), text("state_message")))
+    }
+
+    /// The status of objects.
+    pub(super) fn query(&mut self, objects: &[&str]) -> Result<Value, Refused> {
+        let objects: serde_json::Map<String, Value> =
+            objects.iter().map(|name| ((*name).to_owned(), Value::Null)).collect();
+        let answer = self.call("objects/query", json!({ "objects": objects }), ANSWER)?;
+        Ok(answer["status"].clone())
+    }
+
+    /// All objects of klippy.
+    pub(super) fn objects(&mut self) -> Result<Vec<String>, Refused> {
+        Ok(texts(&self.call("objects/list", json!({}), ANSWER)?["objects"]))
+    }
+
+    /// The names of klippy's heaters.
+    pub(super) fn heaters(&mut self) -> Result<Vec<String>, Refused> {
+        Ok(texts(&self.query(&["heaters"])?["heaters"]["available_heaters"]))
+    }
+
+    /// Another connection, which stops the printer while a command runs.
+    pub(super) fn stop(&mut self) {
+        if let Ok(mut api) = UnixStream::connect(&self.socket) {
+            let _ = api.write_all(b"{\"id\":1,\"method\":\"emergency_stop\"}\x03");
+            self.time.poke();
+            // klippy must have read it before the connection closes.
+            let _ = self.time.sleep(LOOK_FOR_API);
+        }
+    }
+
+    /// Has klippy reset the MCUs and restart itself.
+    pub(super) fn firmware_restart(&mut self) {
+        let until = self.now() + ANSWER;
+        // The answer may come before the restart, or never.
+        let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
+        while self.state().is_ok() && self.now() < until {
+            if self.sleep(LOOK_FOR_API).is_err() {
+                break;
+            }
+        }
+        self.reconnect();
+    }
+
+    /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
+    pub(super) fn reconnect(&mut self) -> bool {
+        let until = self.now() + START;
+        while matches!(self.child.try_wait(), Ok(None)) && self.now() < until {
+            // klippy that takes no more turns answers no more.
+            if self.sleep(LOOK_FOR_API).is_err() {
+                return false;
+            }
+            if let Ok(api) = UnixStream::connect(&self.socket) {
+                self.api = api;
+                self.buffer.clear();
+                self.answers.clear();
+                if self.subscribe().is_ok() {
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Ends klippy. One that hangs is killed.
+    pub(super) fn end(&mut self) {
+        let pid = self.child.id().cast_signed();
+        // Another klippy may run already.
+        let _ = self.running.0.compare_exchange(pid, 0, Ordering::SeqCst, Ordering::SeqCst);
+        // It leads a group of its own, so what it has started ends, too.
+        let group = || signal::killpg(Pid::from_raw(pid), Signal::SIGKILL);
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            let _ = group();
+            return;
+        }
+        let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
+        let until = Instant::now() + END_TIME;
+        while Instant::now() < until {
+            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
+                break;
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+        let _ = group();
+        let _ = self.child.wait();
+    }
+}
+
+/// The texts of a list.
+fn texts(list: &Value) -> Vec<String> {
+    list.as_array().into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
+}
+
+/// The library that gives klippy the printer's clock.
+fn library() -> Result<PathBuf, Trouble> {
+    let program = std::env::current_exe().and_then(std::fs::canonicalize).unwrap_or_default();
+    let folder = program.parent().unwrap_or(Path::new("/"));
+    // cargo's place, and the package's.
+    let places = ["deps", "../lib/pinion-sim"].map(|place| folder.join(place).join(LIBRARY));
+    places.into_iter().find(|place| place.is_file()).ok_or_else(|| {
+        Trouble::new(format!("there is no {LIBRARY} beside {}", program.display()))
+            .remedy("install the whole package, or add --real-time")
+    })
+}
+
+/// The reason why klippy opened no API, in its last words, and what helps.
+fn no_start(folder: &Path, ended: bool) -> Trouble {
+    let last_of = |name: &str| {
+        let said = std::fs::read_to_string(folder.join(name)).unwrap_or_default();
+        said.lines().rev().find(|line| !line.trim().is_empty()).map(str::to_owned)
+    };
+    if !ended {
+        let cause = format!("klippy opens no API within {} s", START.as_secs());
+        return Trouble::new(cause).remedy(format!("read {}", folder.join("klippy.log").display()));
+    }
+    let (file, last) = match (last_of("klippy.out"), last_of("klippy.log")) {
+        (Some(last), _) => ("klippy.out", last),
+        (None, last) => ("klippy.log", last.unwrap_or_else(|| "it says nothing".into())),
+    };
+    let file = folder.join(file);
+    let remedy = if ["ModuleNotFoundError", "ImportError"].iter().any(|error| last.starts_with(error)) {
+        format!("install klippy's requirements, or name its Python with --python; {} has more", file.display())
+    } else {
+        format!("read {}", file.display())
+    };
+    Trouble::new(format!("klippy does not start: {last}")).remedy(remedy)
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_klippy_that_does_not_start_is_explained_by_its_last_words() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        let reason = |ended| no_start(folder.path(), ended).to_string().replace(folder.path().to_str().unwrap(), "F");
+        assert_eq!(reason(false), "klippy opens no API within 60 s: read F/klippy.log");
+        assert_eq!(reason(true), "klippy does not start: it says nothing: read F/klippy.log");
+        said("klippy.log", "Starting Klippy...\n");
+        said("klippy.out", "Traceback\nModuleNotFoundError: No module named 'greenlet'\n");
+        let text = reason(true);
+        assert!(text.starts_with("klippy does not start: ModuleNotFoundError: No module named 'greenlet'"), "{text}");
+        assert!(text.contains("--python"), "{text}");
+        said("klippy.out", "Traceback\nOSError: cannot find chelper.so\n");
+        assert_eq!(reason(true), "klippy does not start: OSError: cannot find chelper.so: read F/klippy.out");
+    }
+}
