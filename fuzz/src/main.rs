@@ -6,7 +6,9 @@
 mod blocks;
 mod dictionary;
 mod printer;
+mod printer_cfg;
 mod printer_config;
+mod status;
 mod trace;
 
 use std::cell::Cell;
@@ -14,6 +16,7 @@ use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
 use pinion_model::{SimBoard, SimConfig};
+use pinion_system::config::read;
 use pinion_testbench::memory::Counting;
 use pinion_testbench::trial;
 
@@ -25,22 +28,29 @@ type Target = (&'static str, fn(&[u8]));
 const TARGETS: &[Target] = &[
     ("blocks", blocks::run),
     ("commands", commands),
-    ("config", pinion::cli::fuzz::config),
+    ("config", config),
     ("dictionary", dictionary::run),
     ("guardian", pinion_runtime::fuzz::guardian),
     ("link", link),
     ("printer", printer::run),
-    ("printer_cfg", pinion::cli::fuzz::printer_cfg),
+    ("printer_cfg", printer_cfg::run),
     ("printer_config", printer_config::run),
     ("search", pinion_runtime::fuzz::search),
     ("sources", pinion_runtime::klippy::sources::fuzz),
-    ("status", pinion::cli::fuzz::status),
+    ("status", status::run),
     ("trace", trace::run),
 ];
 
 /// Any commands to an MCU in virtual time, for hosts of each dialect.
 fn commands(bytes: &[u8]) {
     trial::play(bytes);
+}
+
+/// Any bytes as the configuration of `pinion run`. An error is one that a person can read.
+fn config(bytes: &[u8]) {
+    if let Err(trouble) = read(bytes, &"f.toml") {
+        assert!(trouble.to_string().starts_with("f.toml:"), "{trouble}");
+    }
 }
 
 /// The link between any host and any core.

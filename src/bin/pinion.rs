@@ -6,5 +6,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    pinion::cli::main()
+    pinion::main()
 }

@@ -20,7 +20,7 @@ const KERNEL: &str = "linux-image-arm64";
 const NOT_OFFERED: &str = "apt offers not all packages: check the network, and that its sources name a Debian archive";
 
 /// The first Debian whose QEMU has every board: QEMU 9 added the Raspberry Pi 4. Its kernel has device trees of all boards
-/// of src/cli/boards.rs.
+/// of tools/system/tests/support/boards.rs.
 const RELEASE: &str = "trixie";
 const EMULATOR_PACKAGE: &str = "qemu-system-arm";
 

@@ -115,10 +115,10 @@ fn run(arguments: &Arguments, systems: &[System], shell: bool) -> Result<bool, S
     Ok(ok)
 }
 
-/// Whether the tests of `src/cli/boards.rs` pass with the device trees of Debian's kernel.
+/// Whether the tests of `tools/system/tests/support/boards.rs` pass with the device trees of Debian's kernel.
 fn boards_are_as_in_device_trees(cache: &Cache) -> Result<bool, String> {
     let folder = debian::device_trees(cache)?;
-    println!("the boards of src/cli/boards.rs with {}", folder.display());
+    println!("the boards of tools/system/tests/support/boards.rs with {}", folder.display());
     let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
     cargo
         .current_dir(env!("CARGO_MANIFEST_DIR"))

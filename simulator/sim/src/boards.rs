@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use pinion::cli::end;
+use pinion::end;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 pub(crate) mod heater;
 
 use heater::{Goal, Heater, Wiring};
-use pinion::cli::terminal::ERASE_LINE;
+use pinion::terminal::ERASE_LINE;
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use pinion_client::{Client, Error};

@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use pinion::cli::files;
 use pinion_firmware::board::Board;
 use pinion_firmware::time::{TimeSource, Timing};
 use pinion_firmware::trouble::Trouble;
 use pinion_model::{SimBoard, SimConfig};
+use pinion_system::files;
 
 /// Longest description.
 const DESCRIPTION_MIB: u64 = 1;
@@ -29,7 +29,7 @@ pub(crate) fn text(path: &Path) -> Result<String, Trouble> {
     String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))
 }
 
-/// Makes the board of a description, for the commands of `pinion` ([`pinion::cli::simulator::Open`]).
+/// Makes the board of a description, for the commands of `pinion` ([`pinion::simulator::Open`]).
 pub(crate) fn open(file: Option<&Path>, clock: Arc<dyn TimeSource>) -> Result<(Box<dyn Board>, Timing), Trouble> {
     let board = SimBoard::new(read(file)?, clock)?;
     let timing = board.timing();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program `pinion-sim`: a simulated printer, and the commands of `pinion` on its board.
 //!
-//! `pinion sim` and `--board sim…` start it ([`pinion::cli::simulator`]), so that the program that drives heaters contains
+//! `pinion sim` and `--board sim…` start it ([`pinion::simulator`]), so that the program that drives heaters contains
 //! no simulator.
 
 #![forbid(unsafe_code)]
@@ -13,10 +13,11 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser, Subcommand};
 
-use pinion::cli::console::{self, ConsoleArgs};
-use pinion::cli::dict::{self, DictArgs};
-use pinion::cli::run::{self, RunArgs};
-use pinion::cli::{LogArgs, completions, logging, with_simulator};
+use pinion::console::{self, ConsoleArgs};
+use pinion::dict::{self, DictArgs};
+use pinion::run;
+use pinion::{completions, logging, with_simulator};
+use pinion_system::settings::{LogArgs, RunArgs};
 use printer::SimArgs;
 
 mod attempt;

@@ -11,7 +11,7 @@ use std::time::Duration;
 use pinion_linux::foreign::plain;
 use pinion_runtime::status::form::{State, Status};
 
-use pinion::cli::status::ask_at;
+use pinion::status::ask_at;
 
 /// Time between two questions.
 const PERIOD: Duration = Duration::from_millis(300);

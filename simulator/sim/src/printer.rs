@@ -40,9 +40,9 @@ use crate::own::serve::Own;
 use crate::own_status::OwnStatus;
 use crate::show::Show;
 use crate::toolpath::{Files, PathArgs, PathRecord};
-use pinion::cli::files::Output;
-use pinion::cli::page::{Page, print};
-use pinion::cli::{end, failed, logging};
+use pinion::page::{Page, print};
+use pinion::{end, failed, logging};
+use pinion_system::files::Output;
 use pinion_trace::folder::folders;
 
 /// Options of `pinion-sim`.

@@ -22,8 +22,8 @@ use pinion_model::SimProbe;
 
 use crate::own_status::OwnStatus;
 use changes::Changes;
-use pinion::cli::page::draw;
-use pinion::cli::terminal::{
+use pinion::page::draw;
+use pinion::terminal::{
     DELETE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Size, Terminal, all_scrolls, give_back_at, off,
     on, scrolling, size, to_row, up,
 };

@@ -11,14 +11,14 @@ use std::time::Duration;
 
 use clap::Args;
 
-use pinion::cli::failed;
-use pinion::cli::files::{self, Output};
-use pinion::cli::page::{Page, aligned, print};
+use pinion::failed;
+use pinion::page::{Page, aligned, print};
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_firmware::trouble::Trouble;
 use pinion_model::{
     AskedPath, Body, Comparison, Distances, Recorder, RingWatch, SimProbe, compare, write_gcode, write_stl, write_svg,
 };
+use pinion_system::files::{self, Output};
 
 /// Longest G-code file.
 const GCODE_MIB: u64 = 1024;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use pinion::cli::page::Page;
+use pinion::page::Page;
 use pinion_model::SimProbe;
 use pinion_printer_config::Trouble;
 

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use pinion::cli::page::{Page, print};
-use pinion::cli::terminal::ERASE_LINE;
+use pinion::page::{Page, print};
+use pinion::terminal::ERASE_LINE;
 use pinion_linux::foreign::plain;
 use pinion_printer_config::Place;
 

@@ -43,7 +43,7 @@ pub(crate) fn leave_root(printer_cfg: &Path, folder: Option<&Path>, realtime: bo
     }
     let name = user.as_ref().map_or_else(|| uid.to_string(), |user| user.name.clone());
     log::info!("the trial leaves root's rights: it runs as {name}");
-    pinion::cli::logging::finish();
+    pinion::logging::finish();
     let program = std::env::current_exe().map_err(failed)?;
     let mut setpriv = Command::new("setpriv");
     setpriv.arg(format!("--reuid={uid}")).arg(format!("--regid={gid}"));

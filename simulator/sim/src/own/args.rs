@@ -110,7 +110,7 @@ impl OwnArgs {
     /// The klippy that is named, the one of KLIPPER_DIR, or the only one that this computer has.
     pub(crate) fn klipper(&self) -> Option<PathBuf> {
         let named = || self.klipper.clone().or_else(|| std::env::var_os("KLIPPER_DIR").map(PathBuf::from));
-        named().or_else(pinion::cli::klipper_here)
+        named().or_else(pinion::klipper_here)
     }
 
     /// Whether the command line names the checkout.

@@ -3,8 +3,8 @@
 
 use std::path::{Path, PathBuf};
 
-use pinion::cli::files;
 use pinion_printer_config::Trouble;
+use pinion_system::files;
 
 /// Longest file.
 const MIB_MAX: u64 = 1024;

@@ -13,11 +13,11 @@ use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use pinion::cli::files::Output;
-use pinion::cli::page::Page;
+use pinion::page::Page;
 use pinion_firmware::time::CLOCK_FREQ;
 use pinion_model::{AskedPath, PathPoint, SimProbe, compare};
 use pinion_printer_config::{Config, Trouble};
+use pinion_system::files::Output;
 use serde_json::{Value, json};
 
 use super::host::{Host, NoStart};

@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use pinion::cli::page::Page;
+use pinion::page::Page;
 use pinion_model::{Comparison, Pace};
 use serde_json::{Value, json};
 

@@ -4,8 +4,8 @@
 use std::io::BufReader;
 use std::time::Duration;
 
-use pinion::cli::files;
 use pinion_model::{AskedPath, PathPoint, Recorder, compare};
+use pinion_system::files;
 
 use super::heaters::heat_extruder;
 use super::homing::said_mm;
