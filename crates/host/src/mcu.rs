@@ -15,7 +15,7 @@ use pinion_protocol::vlq;
 use pinion_runtime::FIRMWARE;
 use pinion_sim::SimBoard;
 
-use super::workers::Buses;
+use crate::workers::Buses;
 
 /// Highest number of bytes that wait for an MCU that is busy.
 const INPUT_BYTES_MAX: usize = 1 << 16;
@@ -65,7 +65,7 @@ struct Connection {
 }
 
 /// An MCU and its klippy.
-pub(super) struct BoardMcu {
+pub(crate) struct BoardMcu {
     mcu: Mcu,
     clock: Arc<dyn TimeSource>,
     buses: Buses,
@@ -78,7 +78,7 @@ pub(super) struct BoardMcu {
 
 impl BoardMcu {
     /// The MCU of a board, for a klippy whose sources look up these forms. klippy connects to `socket`.
-    pub(super) fn new(board: SimBoard, forms: Forms, socket: &Path) -> Result<BoardMcu, Trouble> {
+    pub(crate) fn new(board: SimBoard, forms: Forms, socket: &Path) -> Result<BoardMcu, Trouble> {
         let failed = |cause: String| Trouble::new(cause).of(format_args!("the MCU {}", board.name()));
         let dialect = Dialect::new(&FIRMWARE, &board, forms).map_err(|error| failed(error.to_string()))?;
         let listener = UnixListener::bind(socket)
@@ -93,20 +93,20 @@ impl BoardMcu {
     }
 
     /// Another process of klippy comes.
-    pub(super) fn renew(&mut self) {
+    pub(crate) fn renew(&mut self) {
         self.connection = None;
         self.mcu.renew();
     }
 
     /// When something happens next, in nanoseconds of the printer's time.
-    pub(super) fn next_ns(&self) -> u64 {
+    pub(crate) fn next_ns(&self) -> u64 {
         let rests = Some(self.rests_until).filter(|until| *until > self.clock.now());
         let next = self.mcu.next_timer().into_iter().chain(self.buses.next_end()).chain(rests).min();
         next.map_or(u64::MAX, |next| self.clock.duration_of(next).as_nanos() as u64)
     }
 
     /// Does everything that is due. Returns whether klippy has something to read.
-    pub(super) fn turn(&mut self) -> bool {
+    pub(crate) fn turn(&mut self) -> bool {
         loop {
             while self.mcu.run_timers() {}
             self.mcu.run_workers();
@@ -120,7 +120,7 @@ impl BoardMcu {
     }
 
     /// Takes in what klippy has sent.
-    pub(super) fn take_in(&mut self) {
+    pub(crate) fn take_in(&mut self) {
         if let Ok((stream, _)) = self.listener.accept() {
             // It fails for no socket.
             let _ = stream.set_nonblocking(true);
