@@ -265,6 +265,21 @@ impl<W: Watch> Host<W> {
         }
     }
 
+    /// Waits until klippy sends a message like this. It drops all others.
+    ///
+    /// # Errors
+    ///
+    /// None comes.
+    pub fn until_message(&mut self, is_it: impl Fn(&Value) -> bool, limit: Duration) -> Result<Value, Refused> {
+        let until = self.now() + limit;
+        loop {
+            let message = self.message(until)?;
+            if is_it(&message) {
+                return Ok(message);
+            }
+        }
+    }
+
     fn message(&mut self, until: Duration) -> Result<Value, Refused> {
         let mut piece = [0; 4096];
         loop {
@@ -365,11 +380,11 @@ impl<W: Watch> Host<W> {
         }
     }
 
-    /// Has klippy reset the MCUs and restart itself.
-    pub fn firmware_restart(&mut self) {
+    /// Has klippy restart itself, by RESTART or FIRMWARE_RESTART.
+    pub fn restart(&mut self, command: &str) {
         let until = self.now() + ANSWER;
         // The answer may come before the restart, or never.
-        let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
+        let _ = self.gcode(command, ANSWER);
         while self.state().is_ok() && self.now() < until {
             if self.sleep(LOOK_FOR_API).is_err() {
                 break;

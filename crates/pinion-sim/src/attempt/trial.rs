@@ -175,7 +175,7 @@ impl<'a> Trial<'a> {
     fn until_ready_again(&mut self) -> Result<(), String> {
         match self.until_ready() {
             Err(words) if words.contains("is shutdown") => {
-                self.host.firmware_restart();
+                self.host.restart("FIRMWARE_RESTART");
                 self.until_ready()
             }
             ready => ready,
