@@ -73,7 +73,7 @@ help:
 	@echo 'make mutants       do the tests notice if the code is changed? (PACKAGE=pinion-firmware SHARD=7/30)'
 	@echo 'make sanitize      what threads share, in all orders; tests with sanitizers'
 	@echo 'make bench         the benchmarks'
-	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
+	@echo 'make check         formatting, lints, documentation, man pages, licenses, sizes, what the package has'
 	@echo 'make build         the programs: $(PINION) and pinion-sim'
 	@echo 'make install       program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
 	@echo 'make deb           a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
@@ -95,7 +95,7 @@ mainsail: system-packages-mainsail build
 	@PINION='$(PINION)' scripts/mainsail '$(FOLDER)'
 
 build: system-packages-build
-	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-simulator
+	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-sim
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
@@ -218,6 +218,7 @@ check: system-packages-check
 	@# The programs of the tests: those built for themselves would have other features of some crates.
 	'$(CARGO)' test --locked --quiet --no-run
 	CARGO='$(CARGO)' scripts/check-dependencies
+	scripts/check-size
 	scripts/check-man '$(CARGO_TARGET_DIR)/debug/pinion'
 	scripts/check-deb '$(CARGO_TARGET_DIR)/debug/pinion'
 

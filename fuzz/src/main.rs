@@ -13,7 +13,7 @@ use std::cell::Cell;
 use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
-use pinion_sim::{SimBoard, SimConfig};
+use pinion_model::{SimBoard, SimConfig};
 use pinion_testbench::memory::Counting;
 use pinion_testbench::trial;
 

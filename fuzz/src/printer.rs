@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use pinion_firmware::board::Board as _;
 use pinion_firmware::time::{Clock, VirtualClock};
-use pinion_sim::{SimBoard, SimConfig, printer_cfg};
+use pinion_model::{SimBoard, SimConfig, printer_cfg};
 
 pub fn run(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };

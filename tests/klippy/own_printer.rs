@@ -78,7 +78,7 @@ fn a_printer_of_two_boards_is_leveled_and_prints() {
 #[test]
 fn printers_of_the_kind_that_users_have_pass_every_step() {
     let Some(checkout) = checkout("printers_of_the_kind_that_users_have_pass_every_step") else { return };
-    let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kit/printers");
+    let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/support/testkit/printers");
     for (name, count) in [("voron-2.4", 11), ("ender-3", 10), ("mk3", 9), ("ratrig", 12), ("kossel", 9), ("idex", 8)] {
         let (passed, steps) = tried(&checkout, &printers.join(format!("{name}.cfg")), &[]);
         assert!(passed, "{name}: {steps:?}");

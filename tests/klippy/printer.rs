@@ -11,8 +11,8 @@ use std::time::Duration;
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_host::{Host, Launch, MCUS, NoStart, OneClock, Running, Time};
+use pinion_model::{Look, SimConfig, SimProbe, SimWorld};
 use pinion_runtime::klippy::Checkout;
-use pinion_sim::{Look, SimConfig, SimProbe, SimWorld};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

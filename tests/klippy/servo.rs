@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::checkout;
 use super::printer::Printer;
-use pinion_sim::Look;
+use pinion_model::Look;
 
 /// The servo's angle, after it has stopped turning.
 fn servo_degrees(printer: &mut Printer) -> f64 {

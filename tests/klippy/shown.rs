@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::checkout;
-use pinion_sim::Look;
+use pinion_model::Look;
 
 use crate::klippy::python;
 use crate::printer::Printer;

@@ -4,7 +4,7 @@
 #
 #   root.sh FOLDER TREE INITRAMFS RELEASE HERE SOURCES
 #
-# FOLDER gets root.img and initrd. TREE and INITRAMFS are of tests/kit: parts of Debian's kernel package, and
+# FOLDER gets root.img and initrd. TREE and INITRAMFS are of tests/support/testkit: parts of Debian's kernel package, and
 # the modules that it has built. HERE is the folder of this file. SOURCES is a sources.list of Debian 12.
 set -eu
 cd "$1"

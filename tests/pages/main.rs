@@ -114,8 +114,19 @@ fn links_lead_somewhere() {
 
 /// A path from the project's folder, in the pages' form for our files.
 fn is_path(text: &str) -> bool {
-    let folders =
-        ["src/", "crates/", "tests/", "benches/", "systemd/", "udev/", "debian/", "docs/guide/", "docs/develop/"];
+    let folders = [
+        "src/",
+        "crates/",
+        "tools/",
+        "simulator/",
+        "tests/",
+        "benches/",
+        "systemd/",
+        "udev/",
+        "debian/",
+        "docs/guide/",
+        "docs/develop/",
+    ];
     folders.iter().any(|folder| text.starts_with(folder)) && !text.contains([' ', '*', '<'])
 }
 
@@ -154,7 +165,8 @@ fn without_indentation(text: &str) -> String {
 /// So the Rust compiles, and follows the code.
 #[test]
 fn rust_on_a_page_is_part_of_a_source() {
-    let sources = sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("crates"));
+    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let sources: Vec<_> = ["crates", "tests"].iter().flat_map(|folder| sources(&project.join(folder))).collect();
     let mut count = 0;
     for page in pages() {
         for block in page.blocks().iter().filter(|block| block.kind == "rust") {

@@ -81,7 +81,7 @@ fn a_try_reports_a_mistake_that_is_found_before_klippy_starts() {
 
 #[test]
 fn printers_of_the_kind_that_users_have_are_served_without_a_complaint() {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/kit/printers");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/testkit/printers");
     let mut count = 0;
     for file in fs::read_dir(folder).unwrap() {
         let path = file.unwrap().path();

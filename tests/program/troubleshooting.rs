@@ -54,10 +54,9 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 /// The program's sources without their tests, with each literal in its printed form, and the service's script.
 fn sources() -> Vec<(String, String)> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let crates = ["camera", "client", "firmware", "linux", "pinion-sim", "protocol", "runtime", "sim", "trace"];
-    let crates = crates.map(|name| format!("crates/{name}/src"));
-    let mut all: Vec<PathBuf> = crates.iter().flat_map(|folder| files(&root.join(folder))).collect();
-    all.extend(files(&root.join("src")));
+    let rooms = ["crates", "tools", "simulator"].map(|folder| fs::read_dir(root.join(folder)).unwrap());
+    let packages = rooms.into_iter().flatten().map(|entry| entry.unwrap().path()).chain([root.to_owned()]);
+    let mut all: Vec<PathBuf> = packages.flat_map(|package| files(&package.join("src"))).collect();
     all.push(root.join("systemd/link"));
     let source = |path: PathBuf| {
         let text = fs::read_to_string(&path).unwrap();

@@ -11,7 +11,7 @@ use pinion_firmware::board::{
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
-use pinion_sim::SimBoard;
+use pinion_model::SimBoard;
 use pinion_testbench::memory::uncounted;
 
 /// The output on an expander: a chip that may sleep, and that may go.

@@ -298,7 +298,7 @@ impl Host {
     fn heat(&mut self, printer: &mut Printer) {
         let at = self.next_heat.max(printer.rig.now()) + LEAD;
         self.next_heat = at - LEAD + HEAT_EVERY;
-        let heaters = pinion_sim::SimConfig::default_printer().heaters;
+        let heaters = pinion_model::SimConfig::default_printer().heaters;
         let mut powers = [0.0; 3];
         for (n, heater) in heaters.iter().enumerate() {
             if let Some(fraction) = self.readings[n] {

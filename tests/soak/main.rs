@@ -14,8 +14,8 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use pinion_client::Arg;
+use pinion_model::Look;
 use pinion_protocol::vlq::Writer;
-use pinion_sim::Look;
 use pinion_testbench::memory::Counting;
 
 use board::EXPANDED;

@@ -2,7 +2,7 @@
 //! Writing events into a ring, all of them or with a quota.
 
 use pinion_firmware::time::{Clock, Ticks};
-use pinion_sync::ring::{Pen, Ring};
+use pinion_shm::ring::{Pen, Ring};
 
 use super::event::Event;
 
@@ -74,7 +74,7 @@ impl Writer {
 
 #[cfg(test)]
 fn ring(events: usize) -> Ring<'static> {
-    let words = pinion_sync::ring::words(events);
+    let words = pinion_shm::ring::words(events);
     Ring::new(Box::leak((0..words).map(|_| std::sync::atomic::AtomicU64::new(0)).collect()))
 }
 

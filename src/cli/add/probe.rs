@@ -318,7 +318,7 @@ mod tests {
     use super::*;
     use pinion_firmware::trouble::Trouble;
     use pinion_linux::clock::Monotonic;
-    use pinion_sim::{SimBoard, SimConfig};
+    use pinion_model::{SimBoard, SimConfig};
     use proptest::prelude::*;
     use std::collections::BTreeMap;
     use std::sync::Arc;
@@ -518,7 +518,7 @@ mod tests {
     impl Simulated {
         /// The thermometers are on I2C, and nothing has the SPI bus of the header but what `change` puts there.
         fn with(change: impl Fn(String) -> String) -> Simulated {
-            let described = concat!(env!("CARGO_MANIFEST_DIR"), "/crates/sim/src/default.toml");
+            let described = concat!(env!("CARGO_MANIFEST_DIR"), "/simulator/model/src/default.toml");
             let described = std::fs::read_to_string(described).unwrap();
             let described = change(described.replace("bus = \"spidev0.0\"", "bus = \"spidev9.0\""));
             let sensors = [("aht10", 0x38), ("htu21d", 0x40), ("sht3x", 0x44), ("lm75", 0x48), ("bme280", 0x77)];

@@ -21,9 +21,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
 use pinion_linux::clock::Monotonic;
+use pinion_model::{SimBoard, SimConfig, SimProbe, SimWorld};
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
-use pinion_sim::{SimBoard, SimConfig, SimProbe, SimWorld};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

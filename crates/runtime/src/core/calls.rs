@@ -4,7 +4,7 @@
 use rtrb::Consumer;
 
 use pinion_firmware::mcu::Mcu;
-use pinion_sync::progress::Progress;
+use pinion_shm::progress::Progress;
 
 use super::request::{Payload, Request};
 

@@ -23,7 +23,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys::{self, SHARED_WORDS};
-use pinion_sync::heartbeat::{LastBeat, SharedHeartbeat, WorkerSlot};
+use pinion_shm::heartbeat::{LastBeat, SharedHeartbeat, WorkerSlot};
 
 /// How long the core may be silent while the MCU runs.
 pub(crate) const RUNNING: Duration = Duration::from_millis(550);

@@ -22,7 +22,7 @@ use rtrb::Consumer;
 use pinion_firmware::mcu::Mcu;
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 use pinion_linux::clock::monotonic;
-use pinion_sync::progress::Progress;
+use pinion_shm::progress::Progress;
 
 use crate::core::busy_poll::PollBudget;
 use crate::core::heartbeat::{BEAT, Heartbeat};

@@ -14,8 +14,8 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use pinion_firmware::lateness::us;
 use pinion_firmware::mcu::{DeviceWarning, Note, Outbox};
 use pinion_firmware::shutdown::{Shutdown, reason};
-use pinion_sync::progress::Progress;
-use pinion_sync::sleep_flag::SleepFlag;
+use pinion_shm::progress::Progress;
+use pinion_shm::sleep_flag::SleepFlag;
 
 /// Size of the ring of responses. Some 1,000 responses fit.
 const RING_BYTES: usize = 1 << 16;

@@ -12,7 +12,7 @@ use pinion_firmware::mcu::{Dialect, EdgeRecorder, Mcu, Tolerances};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::parker::Parker;
-use pinion_sync::progress::Progress;
+use pinion_shm::progress::Progress;
 
 use crate::core::heartbeat::Heartbeat;
 use crate::core::responses::{self, LinkWake};

@@ -12,7 +12,7 @@ use rtrb::{Producer, PushError};
 use pinion_firmware::mcu::base::Config;
 use pinion_linux::clock::monotonic;
 use pinion_linux::parker::Parker;
-use pinion_sync::progress::Progress;
+use pinion_shm::progress::Progress;
 
 use crate::core::responses::{LinkWake, ResponseReader};
 use crate::core::{Payload, Request};

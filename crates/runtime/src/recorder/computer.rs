@@ -10,7 +10,7 @@ use std::time::Duration;
 use nix::unistd::{Pid, SysconfVar, sysconf};
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
-use pinion_sync::ring::Ring;
+use pinion_shm::ring::Ring;
 
 use pinion_linux::{foreign, throttled};
 use pinion_trace::event::{Event, PowerFault, Watched};
@@ -206,7 +206,7 @@ mod tests {
 
     /// A ring in memory of its own.
     fn ring_of(events: usize) -> Ring<'static> {
-        let words = pinion_sync::ring::words(events);
+        let words = pinion_shm::ring::words(events);
         Ring::new(Box::leak((0..words).map(|_| std::sync::atomic::AtomicU64::new(0)).collect()))
     }
 

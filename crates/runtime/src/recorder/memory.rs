@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use log::debug;
 
 use pinion_linux::sys;
-use pinion_sync::ring::{self, Ring};
-use pinion_sync::seqlock::{self, Seqlock};
+use pinion_shm::ring::{self, Ring};
+use pinion_shm::seqlock::{self, Seqlock};
 
 use pinion_trace::event::Watched;
 use pinion_trace::file::Names;

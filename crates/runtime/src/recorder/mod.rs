@@ -33,7 +33,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic, poll_timeout, wait_until};
 use pinion_protocol::format;
-use pinion_sync::ring::Ring;
+use pinion_shm::ring::Ring;
 
 use crate::FIRMWARE;
 use crate::status::form;

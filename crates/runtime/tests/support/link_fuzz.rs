@@ -15,7 +15,7 @@ use pinion_firmware::mcu::{DialectName, Note, Outbox as _};
 use pinion_firmware::time::VirtualClock;
 use pinion_linux::clock::Monotonic;
 use pinion_protocol::block::{BLOCK_MAX, Found, PAYLOAD_MAX, Received, Receiver, Resync, Sequence, frame};
-use pinion_sync::progress::Progress;
+use pinion_shm::progress::Progress;
 
 use super::*;
 use crate::core::heartbeat::Heartbeat;

@@ -4,13 +4,13 @@
 //! The worker may be interrupted while the clock is high. So on a line that is written through registers, a second worker
 //! watches the pulses of a reading, on another processor. It lowers the clock if a pulse lasts for 5 us. Then only both
 //! being late at once makes a long pulse. The first worker begins a pulse when the second one watches it
-//! (`pinion_sync::watch`). The clock may be low for any time, and may be lowered twice.
+//! (`pinion_shm::watch`). The clock may be low for any time, and may be lowered twice.
 //!
 //! A pulse cannot be cut short: the second worker itself has seen the clock high for 5 us before it lowers it.
 
 use std::sync::Arc;
 
-use pinion_sync::watch::Watch;
+use pinion_shm::watch::Watch;
 
 use crate::board::{Line, Pin};
 use crate::feature::pace::between_ticks;
