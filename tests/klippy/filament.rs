@@ -4,28 +4,27 @@
 use std::path::Path;
 
 use super::checkout;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, rest};
+use super::klippy::{UNHOMED, WHERE_IT_STANDS, rest};
+use super::printer::Printer;
 
 /// A print of `moves` moves of 5 mm of filament each, with a cold hot end.
 fn start_print(checkout: &Path, moves: usize, spool: &str) -> Printer {
-    let describe = |board: String, _: &Path| {
+    let describe = |board: String| {
         let changed = board.replace("length_mm = 330000.0\n", spool);
         assert_ne!(changed, board, "the built-in printer has another spool");
         changed
     };
-    let folder = |tty: &str| tty.trim_end_matches("/tty").to_owned();
     let change = |config: String| {
-        let tty = config.lines().find_map(|line| line.strip_prefix("serial: ")).unwrap().to_owned();
         let cold = config.replace("min_extrude_temp: 170", "min_extrude_temp: 0");
         assert_ne!(cold, config);
-        format!("{cold}\n[pause_resume]\n\n[virtual_sdcard]\npath: {}\n{UNHOMED}", folder(&tty))
+        format!("{cold}\n[pause_resume]\n\n[virtual_sdcard]\npath: .\n{UNHOMED}")
     };
-    let mut printer = Printer::start_here(checkout, describe, change);
+    let mut printer = Printer::start_on(checkout, describe, change);
     let part: String = (0..moves).map(|n| format!("G1 X{} E5 F1500\n", 30 + 25 * (n % 2))).collect();
     printer.write("part.gcode", &format!("{WHERE_IT_STANDS}\nM83\nG1 X30 Y30 Z5 F6000\n{part}"));
     printer.until_object(SWITCH, "filament_detected", true);
     assert_eq!(
-        rest(&printer.answer("QUERY_FILAMENT_SENSOR SENSOR=filament"), "Filament Sensor filament: "),
+        rest(&printer.gcode("QUERY_FILAMENT_SENSOR SENSOR=filament"), "Filament Sensor filament: "),
         "filament detected"
     );
     printer.gcode("SDCARD_PRINT_FILE FILENAME=part.gcode");
@@ -47,7 +46,7 @@ fn a_print_pauses_as_the_filament_runs_out() {
     printer.gcode("M400");
     assert!(!detects(&mut printer, SWITCH));
     assert_eq!(
-        rest(&printer.answer("QUERY_FILAMENT_SENSOR SENSOR=filament"), "Filament Sensor filament: "),
+        rest(&printer.gcode("QUERY_FILAMENT_SENSOR SENSOR=filament"), "Filament Sensor filament: "),
         "filament not detected"
     );
     assert_eq!(printer.object("print_stats")["state"], "paused");

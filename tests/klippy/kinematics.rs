@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use super::checkout;
-use super::klippy::Printer;
+use super::printer::Printer;
 
 /// A motor of the description, with its pins.
 fn axis(name: &str, keys: &str) -> String {
@@ -24,7 +24,7 @@ fn start(checkout: &Path, board: String, sections: String) -> Printer {
         let mcus = &printed[..end];
         format!("{mcus}\n[force_move]\nenable_force_move: True\n{sections}")
     };
-    Printer::start_here(checkout, |_, _| board, mcus)
+    Printer::start_on(checkout, |_| board, mcus)
 }
 
 #[track_caller]
@@ -68,8 +68,7 @@ fn an_endstop_of_the_toolhead_stops_the_motors_of_the_main_board() {
     // klippy stops the motors some milliseconds after the endstop of another board, and calculates the difference from
     // the time. The two clocks agree within some 10 us.
     assert_at(&printer, [100.0, 50.0, 10.0], 0.1);
-    printer.gcode("FIRMWARE_RESTART");
-    printer.until_state("ready");
+    printer.restart("FIRMWARE_RESTART");
     printer.gcode("G28\nG1 X30 Y120 Z5 F6000\nM400");
     assert_at(&printer, [30.0, 120.0, 5.0], 0.1);
 }
@@ -110,7 +109,12 @@ fn klippy_homes_and_moves_a_polar_printer() {
     // A turn of the bed is 80 turns of its motor.
     let steps_per_radian = 80.0 * 3200.0 / std::f64::consts::TAU;
     let bed = axis("bed", &format!("steps_per_mm = {steps_per_radian}"));
-    let [arm, z] = [rail("arm", "arm_end"), rail("z", "z_end")];
+    let z = rail("z", "z_end");
+    // The arm homes away from the center, where the bed has no angle.
+    let keys = format!("{STEPS}travel_mm = 200.0\nstart_mm = 150.0\nendstop_pin = \"arm_end\"\nendstop_at = \"max\"");
+    let section =
+        "endstop_pin: arm_end\nrotation_distance: 40\nposition_endstop: 200\nposition_max: 200\nhoming_speed: 20";
+    let arm = [axis("arm", &keys), stepper("stepper_arm", "arm", section)];
     let board = format!("[kinematics]\nkind = \"polar\"\n{bed}{}{}", arm[0], z[0]);
     let bed = stepper("stepper_bed", "bed", "gear_ratio: 80:1");
     let sections = format!("[printer]\nkinematics: polar\n{LIMITS}{bed}{}{}", arm[1], z[1]);

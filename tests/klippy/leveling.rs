@@ -4,8 +4,9 @@
 use std::path::Path;
 
 use super::checkout;
-use super::klippy::{Printer, example};
-use super::probes::{STEP_MM, home, probed};
+use super::klippy::example;
+use super::printer::Printer;
+use super::probes::{STEP_MM, probed};
 
 /// The positions of the motors of the z axis.
 fn motors(printer: &Printer) -> Vec<f64> {
@@ -28,11 +29,11 @@ fn range(values: &[f64]) -> f64 {
 
 /// Homes a gantry that hangs askew, and levels it.
 fn level(checkout: &Path, change: fn(String) -> String, command: &str, corners: &[[f64; 2]; 4]) {
-    let describe = |board: String, _: &Path| change(example(&board, "Four Z motors"));
-    let mut printer = Printer::start_here(checkout, describe, |config| config);
-    home(&mut printer, "");
+    let describe = |board: String| change(example(&board, "Four Z motors"));
+    let mut printer = Printer::start_on(checkout, describe, |config| config);
+    printer.gcode("G28");
     assert!(range(&heights(&mut printer, *corners)) > 0.2, "it is level from the start");
-    let said = printer.answer(&format!("G1 Z5 F600\n{command}"));
+    let said = printer.gcode(&format!("G1 Z5 F600\n{command}"));
     let after = heights(&mut printer, *corners);
     assert!(range(&after) < 4.0 * STEP_MM, "{after:?}\n{said}");
     let motors = motors(&printer);
@@ -77,9 +78,9 @@ fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
 #[test]
 fn klippy_probes_the_bed_of_a_delta_printer() {
     let Some(checkout) = checkout("klippy_probes_the_bed_of_a_delta_printer") else { return };
-    let describe = |board: String, _: &Path| example(&board, "A delta printer");
-    let mut printer = Printer::start_here(&checkout, describe, |config| config);
-    home(&mut printer, "");
+    let describe = |board: String| example(&board, "A delta printer");
+    let mut printer = Printer::start_on(&checkout, describe, |config| config);
+    printer.gcode("G28");
     for [x, y] in [[0.0, 0.0], [60.0, 10.0], [-40.0, 50.0]] {
         let [z] = heights(&mut printer, [[x, y]]);
         assert!((z - bed_mm(x, y)).abs() < 0.02, "{x} {y}: {z} {}", bed_mm(x, y));
@@ -90,9 +91,9 @@ fn klippy_probes_the_bed_of_a_delta_printer() {
 #[test]
 fn klippy_homes_and_moves_a_corexy_printer() {
     let Some(checkout) = checkout("klippy_homes_and_moves_a_corexy_printer") else { return };
-    let describe = |board: String, _: &Path| example(&board, "A CoreXY printer");
-    let mut printer = Printer::start_here(&checkout, describe, |config| config);
-    home(&mut printer, "");
+    let describe = |board: String| example(&board, "A CoreXY printer");
+    let mut printer = Printer::start_on(&checkout, describe, |config| config);
+    printer.gcode("G28");
     for place in [[30.0, 20.0, 5.0], [200.0, 20.0, 5.0], [200.0, 190.0, 1.0], [17.5, 33.25, 60.0]] {
         let [x, y, z] = place;
         printer.gcode(&format!("G1 X{x} Y{y} Z{z} F9000\nM400"));
@@ -108,11 +109,10 @@ fn klippy_homes_and_moves_a_corexy_printer() {
 fn klippy_calibrates_a_delta_printer() {
     let Some(checkout) = checkout("klippy_calibrates_a_delta_printer") else { return };
     // A flat bed, and a printer.cfg with a wrong radius and wrong ends of the towers.
-    let describe = |board: String, _: &Path| {
-        example(&board, "A delta printer").replace("[bed]\nx_slope_mm = 0.1\nbow_mm = 0.05\n", "")
-    };
+    let describe =
+        |board: String| example(&board, "A delta printer").replace("[bed]\nx_slope_mm = 0.1\nbow_mm = 0.05\n", "");
     let mut true_endstop = 0.0;
-    let mut printer = Printer::start_here(&checkout, describe, |config| {
+    let mut printer = Printer::start_on(&checkout, describe, |config| {
         let (_, endstop) = config.split_once("position_endstop: ").unwrap();
         let endstop = endstop.lines().next().unwrap();
         true_endstop = endstop.parse().unwrap();
@@ -120,7 +120,7 @@ fn klippy_calibrates_a_delta_printer() {
         let of_a = format!("position_endstop: {endstop}");
         config.replacen(&of_a, &format!("position_endstop: {}", true_endstop + 0.3), 1)
     });
-    home(&mut printer, "");
+    printer.gcode("G28");
     let places = [[0.0, 0.0], [60.0, 0.0], [-30.0, 50.0], [-30.0, -50.0]];
     let before = heights(&mut printer, places);
     assert!(range(&before) > 0.15, "{before:?}");

@@ -2,18 +2,16 @@
 //! A print from the virtual SD card, with the G-code of slicers.
 
 use super::checkout;
-use super::klippy::Printer;
+use super::printer::Printer;
 
 /// The printer.cfg of a user who prints in this way, with an extruder that works cold.
 fn configure(config: String) -> String {
-    let tty = config.lines().find_map(|line| line.strip_prefix("serial: ")).unwrap().to_owned();
     let cold = config.replace("min_extrude_temp: 170", "min_extrude_temp: 0\npressure_advance: 0.03");
     assert_ne!(cold, config);
     format!(
-        "{cold}\n[virtual_sdcard]\npath: {}\n\n[pause_resume]\n\n[gcode_arcs]\nresolution: 0.2\n\n\
+        "{cold}\n[virtual_sdcard]\npath: .\n\n[pause_resume]\n\n[gcode_arcs]\nresolution: 0.2\n\n\
          [firmware_retraction]\nretract_length: 0.8\nretract_speed: 40\nunretract_extra_length: 0.1\n\
-         unretract_speed: 20\n\n[skew_correction]\n\n[exclude_object]\n",
-        tty.trim_end_matches("/tty")
+         unretract_speed: 20\n\n[skew_correction]\n\n[exclude_object]\n"
     )
 }
 
@@ -55,7 +53,7 @@ const PAUSED_IN: usize = 1;
 #[test]
 fn a_print_from_the_virtual_sd_card_ends_at_the_exact_place() {
     let Some(checkout) = checkout("a_print_from_the_virtual_sd_card_ends_at_the_exact_place") else { return };
-    let mut printer = Printer::start_here(&checkout, |board, _| board, configure);
+    let mut printer = Printer::start_on(&checkout, |board| board, configure);
     let [ac, bd, ad] = SKEW;
     let mut part = format!(
         "EXCLUDE_OBJECT_DEFINE NAME=SQUARE CENTER=50,50\nEXCLUDE_OBJECT_DEFINE NAME=CIRCLE CENTER=120,100\n\

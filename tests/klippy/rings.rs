@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use super::checkout;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, rest};
+use super::klippy::{UNHOMED, WHERE_IT_STANDS, rest};
+use super::printer::Printer;
 
 /// The resonances of the built-in printer.
 const RESONANCES_HZ: [(&str, f64); 2] = [("x", 57.0), ("y", 43.5)];
@@ -15,13 +16,9 @@ const RESONANCES_HZ: [(&str, f64); 2] = [("x", 57.0), ("y", 43.5)];
 const RATE_HZ: f64 = 400.0 * 1.004;
 const G: f64 = 9806.65;
 
-/// A printer with a chip that takes 400 samples a second, far more than the resonances need. At klippy's 3200 the
-/// chip's FIFO lasts 10 ms. A computer that runs many tests at once is sometimes later than that.
+/// A printer with a chip that takes 400 samples a second, far more than the resonances need.
 fn start(checkout: &Path) -> Printer {
-    let change = |config: String| config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n") + UNHOMED;
-    let mut printer = Printer::start_with(checkout, change);
-    printer.until_state("ready");
-    printer
+    Printer::start_with(checkout, |config| config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n") + UNHOMED)
 }
 
 /// A unique name for klippy's files, which it writes to /tmp.
@@ -32,10 +29,10 @@ fn name(what: &str) -> String {
 /// A file of klippy's, moved away from /tmp: the names of its columns, and its lines.
 fn table(file: String) -> (Vec<String>, Vec<Vec<f64>>) {
     let path = PathBuf::from(file);
-    // A separate process writes it. It is complete when it stops growing.
-    let end = Instant::now() + Duration::from_secs(30);
+    // A separate process writes it. It is complete when it stops growing behind a whole line.
+    let end = Instant::now() + Duration::from_secs(60);
     let (mut text, mut before) = (String::new(), usize::MAX);
-    while text.len() != before || text.is_empty() {
+    while text.len() != before || !text.ends_with('\n') {
         assert!(Instant::now() < end, "{} is not written", path.display());
         thread::sleep(Duration::from_millis(500));
         before = text.len();
@@ -69,7 +66,7 @@ fn an_accelerometer_is_asked_and_measures_without_a_gap() {
     const SECONDS: f64 = 10.0;
     let Some(checkout) = checkout("an_accelerometer_is_asked_and_measures_without_a_gap") else { return };
     let mut printer = start(&checkout);
-    let answer = printer.answer("ACCELEROMETER_QUERY");
+    let answer = printer.gcode("ACCELEROMETER_QUERY");
     let said = rest(&answer, "accelerometer values (x, y, z): ");
     let values: Vec<f64> = said.split(", ").map(|value| value.parse().unwrap()).collect();
     // The noise of a sample is 60 to 90 mm/s^2, and at most three and a half times that.
@@ -114,7 +111,7 @@ fn klippy_calibrates_its_input_shaper_for_the_resonances() {
     printer.gcode(WHERE_IT_STANDS);
     for (axis, hz) in RESONANCES_HZ {
         let name = name("calibrate");
-        let said = printer.answer(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
+        let said = printer.gcode(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
         // The frequency of a shaper is the resonance for which it is made (extras/shaper_defs.py). Of klippy's fitted
         // shapers, "mzv" has one notch, which is on the resonance. Shapers with several notches have them beside the
         // resonance.
@@ -127,7 +124,7 @@ fn klippy_calibrates_its_input_shaper_for_the_resonances() {
         // klippy uses its recommendation.
         let (shaper, shaper_hz) = recommended.split_once(&format!(", shaper_freq_{axis} = ")).unwrap();
         let shaper_hz: f64 = shaper_hz.trim_end_matches(" Hz").parse().unwrap();
-        let in_use = printer.answer("SET_INPUT_SHAPER");
+        let in_use = printer.gcode("SET_INPUT_SHAPER");
         let in_use = rest(&in_use, &format!("shaper_type_{axis}:{shaper} shaper_freq_{axis}:"));
         let in_use_hz: f64 = in_use.split(' ').next().unwrap().parse().unwrap();
         assert!((in_use_hz - shaper_hz).abs() < 0.06, "{in_use}, not {recommended}");

@@ -1,36 +1,24 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Parts that move independent of the head: a servo, and a stepper of its own.
 
-use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::checkout;
-use super::klippy::Printer;
+use super::printer::Printer;
 use pinion_model::Look;
 
 /// The servo's angle, after it has stopped turning.
-fn servo_degrees(printer: &Printer) -> f64 {
-    let look = || {
-        let sight = printer.probe().sights().find(|(name, _)| *name == "servo arm").unwrap().1;
-        let Look::Angle { degrees } = sight else { panic!("{sight}") };
-        degrees
-    };
-    let (mut last, mut since): (f64, _) = (look(), Instant::now());
-    while since.elapsed() < Duration::from_secs(1) {
-        std::thread::sleep(Duration::from_millis(50));
-        let now = look();
-        if now != last {
-            (last, since) = (now, Instant::now());
-        }
-    }
-    last
+fn servo_degrees(printer: &mut Printer) -> f64 {
+    printer.sleep(Duration::from_secs(1));
+    let Look::Angle { degrees } = printer.sight("servo arm") else { panic!("it has another look") };
+    degrees
 }
 
 #[test]
 fn a_servo_turns_to_its_angle() {
     let Some(checkout) = checkout("a_servo_turns_to_its_angle") else { return };
-    let mut printer = Printer::start_here(&checkout, |board, _| board, |config| config);
-    assert_eq!(servo_degrees(&printer), 0.0);
+    let mut printer = Printer::start_on(&checkout, |board| board, |config| config);
+    assert_eq!(servo_degrees(&mut printer), 0.0);
     for (command, degrees) in [
         ("ANGLE=30", 30.0),
         ("ANGLE=120", 120.0),
@@ -41,7 +29,7 @@ fn a_servo_turns_to_its_angle() {
         ("ANGLE=0", 0.0),
     ] {
         printer.gcode(&format!("SET_SERVO SERVO=arm {command}\nM400"));
-        let found = servo_degrees(&printer);
+        let found = servo_degrees(&mut printer);
         // A pulse of a millisecond is 50,000 ticks, so the angle is exact to the last digit.
         assert!((found - degrees).abs() < 0.11, "{command}: {found}");
     }
@@ -53,8 +41,8 @@ fn a_manual_stepper_homes_and_moves() {
     let lift = "[[axis]]\nname = \"lift\"\nstep_pin = \"lift_step\"\ndir_pin = \"lift_dir\"\n\
                 enable_pin = \"!lift_enable\"\nsteps_per_mm = 50.0\ntravel_mm = 40.0\nstart_mm = 17.0\n\
                 endstop_pin = \"lift_endstop\"\nhoming_mm_per_s = 8.0\n\n[[heater]]";
-    let describe = |board: String, _: &Path| board.replacen("[[heater]]", lift, 1);
-    let mut printer = Printer::start_here(&checkout, describe, |config| config);
+    let describe = |board: String| board.replacen("[[heater]]", lift, 1);
+    let mut printer = Printer::start_on(&checkout, describe, |config| config);
     let position = |printer: &Printer| printer.probe().axis("lift").unwrap().position_mm;
     printer.gcode("MANUAL_STEPPER STEPPER=lift ENABLE=1 SET_POSITION=30 MOVE=33.5 SPEED=20 SYNC=1\nM400");
     assert_eq!(position(&printer), 20.5);

@@ -5,20 +5,10 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::checkout;
-use crate::klippy::{Printer, python};
+use pinion_model::Look;
 
-/// The pixels of a display's picture in Braille, by row.
-fn pixels(picture: &str) -> Vec<Vec<bool>> {
-    // The dots' numbers by column and row (Unicode, "Braille Patterns").
-    const DOTS: [[u32; 4]; 2] = [[0, 1, 2, 6], [3, 4, 5, 7]];
-    let row = |y: usize| -> Option<Vec<bool>> {
-        let line = picture.lines().nth(y / 4)?.chars();
-        // A dark display has no picture.
-        let line: Vec<u32> = line.map(|c| (c as u32).checked_sub(0x2800)).collect::<Option<_>>()?;
-        Some((0..128).map(|x| line[x / 2] >> DOTS[x % 2][y % 4] & 1 != 0).collect())
-    };
-    (0..64).map_while(row).collect()
-}
+use crate::klippy::python;
+use crate::printer::Printer;
 
 /// klippy's own font: 16 rows for each of its characters.
 fn font(checkout: &Path) -> Vec<Vec<u8>> {
@@ -35,87 +25,92 @@ fn font(checkout: &Path) -> Vec<Vec<u8>> {
 }
 
 /// The text of a display, in rows of 16 characters. A shape that is not a printable character is `?`.
-fn text(picture: &str, font: &[Vec<u8>]) -> Vec<String> {
-    let pixels = pixels(picture);
+fn text(look: &Look, font: &[Vec<u8>]) -> Vec<String> {
+    let Look::Pixels { width: 128, height: 64, is_on: true, lit } = look else { return Vec::new() };
     let glyph = |row: usize, column: usize| -> Vec<u8> {
-        let byte = |y: usize| (0..8).fold(0, |byte, x| byte << 1 | u8::from(pixels[16 * row + y][8 * column + x]));
+        let byte =
+            |y: usize| (0..8).fold(0, |byte, x| byte << 1 | u8::from(lit[128 * (16 * row + y) + 8 * column + x]));
         (0..16).map(byte).collect()
     };
     let character = |row, column| {
         let glyph = glyph(row, column);
         (b' '..b'\x7f').find(|c| font[usize::from(*c)] == glyph).map_or('?', char::from)
     };
-    (0..pixels.len() / 16).map(|row| (0..16).map(|column| character(row, column)).collect()).collect()
+    (0..4).map(|row| (0..16).map(|column| character(row, column)).collect()).collect()
 }
 
-fn last_row(picture: &str, font: &[Vec<u8>]) -> String {
-    text(picture, font).pop().unwrap_or_default().trim_end().to_owned()
+fn last_row(look: &Look, font: &[Vec<u8>]) -> String {
+    text(look, font).pop().unwrap_or_default().trim_end().to_owned()
+}
+
+/// The colors of a strip's lights.
+fn colours(printer: &mut Printer, strip: &str) -> String {
+    printer.sight(strip).to_string()
 }
 
 #[test]
 fn lights_have_the_colours_that_klippy_gives_them() {
     let Some(checkout) = checkout("lights_have_the_colours_that_klippy_gives_them") else { return };
-    let mut printer = Printer::start_shown(
+    let mut printer = Printer::start_on(
         &checkout,
-        |board, _| board,
+        |board| board,
         |config| {
             let template = "[display_template glow]\nparam_red: 0.2\ntext: {param_red}, 0.0, {printer.toolhead.max_velocity / 600}";
             format!("{config}\n{template}, 0.0\n")
         },
     );
-    printer.until_state("ready");
-    printer.until_shown("strip", |strip| strip == "off off off off off off off off");
+    assert_eq!(colours(&mut printer, "strip"), "off off off off off off off off");
     printer.gcode("SET_LED LED=strip RED=1 GREEN=0.5 BLUE=0 INDEX=2");
-    printer.until_shown("strip", |strip| strip == "off yellow#ff8000 off off off off off off");
+    assert_eq!(colours(&mut printer, "strip"), "off #ff8000 off off off off off off");
     printer.gcode("SET_LED LED=strip BLUE=1 INDEX=8 TRANSMIT=0\nSET_LED LED=strip GREEN=0.01 INDEX=1");
-    printer.until_shown("strip", |strip| strip == "green#000300 yellow#ff8000 off off off off off blue#0000ff");
+    assert_eq!(colours(&mut printer, "strip"), "#000300 #ff8000 off off off off off #0000ff");
     printer.gcode("SET_LED LED=strip RED=1 GREEN=1 BLUE=1");
-    printer.until_shown("strip", |strip| strip == ["white#ffffff"; 8].join(" "));
+    assert_eq!(colours(&mut printer, "strip"), ["#ffffff"; 8].join(" "));
     printer.gcode("SET_LED_TEMPLATE LED=strip TEMPLATE=glow param_red=0.4 INDEX=3");
-    printer.until_shown("strip", |strip| strip.split(' ').nth(2) == Some("magenta#660080"));
+    assert_eq!(colours(&mut printer, "strip").split(' ').nth(2), Some("#660080"));
     // klippy drives these lines bit by bit, in messages of 20 bytes.
     printer.gcode("SET_LED LED=dots RED=0.2 INDEX=1\nSET_LED LED=dots BLUE=1 INDEX=4");
-    printer.until_shown("dots", |dots| dots == "red#330000 off off blue#0000ff");
+    assert_eq!(colours(&mut printer, "dots"), "#330000 off off #0000ff");
     printer.gcode("SET_LED LED=light WHITE=0.5\nG4 P500");
-    printer.until_shown("light", |light| {
-        light.strip_suffix(" %").is_some_and(|percent| (40..60).contains(&percent.parse().unwrap_or(0)))
-    });
+    let light = |printer: &mut Printer| {
+        printer.sleep(std::time::Duration::from_secs(1));
+        printer.probe().output("light").unwrap().brightness
+    };
+    assert!((light(&mut printer) - 0.5).abs() < 0.1, "{}", light(&mut printer));
     printer.gcode("SET_LED LED=light WHITE=1");
-    printer.until_shown("light", |light| light == "on");
+    assert_eq!(light(&mut printer), 1.0);
 }
 
 #[test]
 fn the_display_shows_what_klippy_writes() {
     let Some(checkout) = checkout("the_display_shows_what_klippy_writes") else { return };
     let font = font(&checkout);
-    let mut printer = Printer::start_shown(
+    let mut printer = Printer::start_on(
         &checkout,
-        |board, _| board,
+        |board| board,
         |config| {
             let data = "[display_data mine first]\nposition: 1, 3\ntext: { \"%.1f\" % printer.gcode_move.speed }";
             format!("{config}\n{data}\n[force_move]\nenable_force_move: True\n")
         },
     );
-    printer.until_state("ready");
-    printer.until_shown("display", |picture| last_row(picture, &font) == "Ready");
+    assert_eq!(last_row(&printer.sight("display"), &font), "Ready");
     // Icons, which are not text, with their values beside them.
     let status = ["?? 25?    ??  0%", "?? 25?    ??100%", "?????????? 00:00", "Ready           "];
-    printer.until_shown("display", |picture| text(picture, &font) == status);
+    assert_eq!(text(&printer.sight("display"), &font), status);
     printer.gcode("M117 Pinion: 42 <ok>");
-    printer.until_shown("display", |picture| last_row(picture, &font) == "Pinion: 42 <ok>");
+    assert_eq!(last_row(&printer.sight("display"), &font), "Pinion: 42 <ok>");
     printer.gcode("M117\nG1 F2250\nSET_DISPLAY_GROUP GROUP=mine");
-    printer.until_shown("display", |picture| {
-        text(picture, &font).iter().map(|row| row.trim_end()).eq(["", "   2250.0", "", ""])
-    });
+    let picture = printer.sight("display");
+    assert!(text(&picture, &font).iter().map(|row| row.trim_end()).eq(["", "   2250.0", "", ""]), "{picture}");
     // The axis was at 60 mm.
-    printer.gcode("FORCE_MOVE STEPPER=stepper_x DISTANCE=-22.5 VELOCITY=50");
-    printer.until_shown("x", |x| x == "37.50 mm");
+    printer.gcode("FORCE_MOVE STEPPER=stepper_x DISTANCE=-22.5 VELOCITY=50\nM400");
+    assert_eq!(printer.probe().axis("x").unwrap().position_mm, 37.5);
     printer.gcode("M117 there\nSET_DISPLAY_GROUP GROUP=_default_16x4");
-    printer.until_shown("display", |picture| last_row(picture, &font) == "there");
+    assert_eq!(last_row(&printer.sight("display"), &font), "there");
     // A restart does not reset the display. klippy writes all of it again.
     printer.restart("FIRMWARE_RESTART");
     printer.gcode("M117 again");
-    printer.until_shown("display", |picture| last_row(picture, &font) == "again");
+    assert_eq!(last_row(&printer.sight("display"), &font), "again");
 }
 
 /// Adds a converter in the bed to the existing ones.
@@ -129,13 +124,12 @@ fn converters_read_what_the_heater_has() {
     const CHIPS: [&str; 4] = ["max31855", "max6675", "max31856", "max31865"];
     let Some(checkout) = checkout("converters_read_what_the_heater_has") else { return };
     // The bed is hot and cools.
-    let hot = |board: String, _: &Path| {
+    let hot = |board: String| {
         let hot = board.replace("name = \"heater_bed\"\n", "name = \"heater_bed\"\nstart_celsius = 90.0\n");
         CHIPS.iter().fold(hot, |board, chip| with_converter(board, chip, ""))
     };
-    let mut printer = Printer::start_shown(&checkout, hot, |config| config);
-    printer.until_state("ready");
-    let celsius = |printer: &Printer| printer.shown("heater_bed").trim_end_matches(" C").parse::<f64>().unwrap();
+    let mut printer = Printer::start_on(&checkout, hot, |config| config);
+    let celsius = |printer: &Printer| printer.probe().heater("heater_bed").unwrap().celsius;
     let mut last = f64::INFINITY;
     for _ in 0..2 {
         printer.gcode("G4 P8000");
@@ -144,7 +138,7 @@ fn converters_read_what_the_heater_has() {
         last = bed;
         for chip in CHIPS {
             let read = printer.object(&format!("temperature_sensor {chip}"))["temperature"].as_f64().unwrap();
-            // The display shows whole degrees, and klippy smooths over a second.
+            // klippy smooths over a second.
             assert!((read - bed).abs() < 1.5, "{chip}: {read} of {bed}");
         }
     }
@@ -163,32 +157,12 @@ fn a_broken_sensor_stops_the_mcu_at_its_third_bad_value() {
         ("max31856", "short_to_supply", "Max31856: Over/Under Voltage Fault"),
         ("max31865", "open", "Max31865 RTD input is disconnected"),
     ] {
-        let broken = |board: String, _: &Path| with_converter(board, chip, &format!("fault = \"{fault}\"\n"));
-        let mut printer = Printer::start_shown(&checkout, broken, |config| config);
+        let broken = |board: String| with_converter(board, chip, &format!("fault = \"{fault}\"\n"));
+        let mut printer = Printer::launch(&checkout, broken, |config| config);
         printer.until_state("shutdown");
-        let log = printer.host_log("Thermocouple reader fault", 1);
+        let log = printer.host_log();
         let times = log.matches(told).count();
         assert_eq!(times, 3, "{told}: {log}");
-        printer.until_logged("reports fault bits");
+        assert!(printer.log().contains("reports fault bits"), "{}", printer.log());
     }
-}
-
-#[test]
-fn a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple() {
-    let Some(checkout) = checkout("a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple") else {
-        return;
-    };
-    let mut printer = Printer::start_shown(&checkout, |board, _| board, |config| config);
-    printer.until_state("ready");
-    // klippy's PWM cycle is 10 ms. The fan needs 0.4 s to follow.
-    printer.gcode("M106 S128\nG4 P8000");
-    let rpm = |printer: &Printer| printer.shown("fan").trim_end_matches(" rpm").parse::<f64>().unwrap();
-    let first = rpm(&printer);
-    assert!((first - 4500.0 * 128.0 / 255.0).abs() < 45.0, "{first}");
-    let lines = |printer: &Printer| printer.all_shown().matches("] fan: ").count();
-    let before = lines(&printer);
-    printer.gcode("G4 P20000");
-    assert!(lines(&printer) - before <= 3, "{}", printer.all_shown());
-    printer.gcode("M107\nG4 P8000");
-    assert!(rpm(&printer) < 5.0, "{}", rpm(&printer));
 }

@@ -1,19 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A second extruder on a second carriage, fans that follow a temperature, a light of four colors.
 
-use std::path::Path;
-
 use super::checkout;
-use super::klippy::{Printer, example};
+use super::klippy::example;
+use super::printer::Printer;
 
 #[test]
 fn klippy_uses_a_second_extruder_and_a_second_carriage() {
     let Some(checkout) = checkout("klippy_uses_a_second_extruder_and_a_second_carriage") else { return };
-    let describe = |board: String, _: &Path| example(&board, "A second extruder");
-    let mut printer = Printer::start_here(&checkout, describe, |config| {
-        config.replace("min_extrude_temp: 170", "min_extrude_temp: 0")
-    });
-    super::probes::home(&mut printer, "");
+    let describe = |board: String| example(&board, "A second extruder");
+    let mut printer =
+        Printer::start_on(&checkout, describe, |config| config.replace("min_extrude_temp: 170", "min_extrude_temp: 0"));
+    printer.gcode("G28");
     let at = |printer: &Printer, axis: &str| printer.probe().axis(axis).unwrap().position_mm;
     assert_eq!((at(&printer, "x"), at(&printer, "dual_carriage")), (0.0, 220.0));
     printer.gcode("SET_DUAL_CARRIAGE CARRIAGE=dual_carriage\nACTIVATE_EXTRUDER EXTRUDER=extruder1\nM83");
@@ -21,7 +19,7 @@ fn klippy_uses_a_second_extruder_and_a_second_carriage() {
     assert_eq!((at(&printer, "x"), at(&printer, "dual_carriage")), (0.0, 150.0));
     assert_eq!((at(&printer, "extruder"), at(&printer, "extruder1")), (0.0, 4.0));
     printer.gcode("M104 T1 S60");
-    printer.until_heating("extruder1");
+    printer.gcode("TEMPERATURE_WAIT SENSOR=extruder1 MINIMUM=30");
     let first = printer.object("extruder")["temperature"].as_f64().unwrap();
     assert!(first < 26.0, "{first}");
     printer.gcode("TURN_OFF_HEATERS\nSET_DUAL_CARRIAGE CARRIAGE=x\nACTIVATE_EXTRUDER EXTRUDER=extruder");
@@ -34,8 +32,8 @@ fn klippy_uses_a_second_extruder_and_a_second_carriage() {
 #[test]
 fn klippy_cools_a_chamber_by_its_fan() {
     let Some(checkout) = checkout("klippy_cools_a_chamber_by_its_fan") else { return };
-    let describe = |board: String, _: &Path| example(&board, "A chamber with a fan");
-    let mut printer = Printer::start_here(&checkout, describe, |config| config);
+    let describe = |board: String| example(&board, "A chamber with a fan");
+    let mut printer = Printer::start_on(&checkout, describe, |config| config);
     let rpm = |printer: &Printer, fan: &str| printer.probe().fan(fan).unwrap().rpm;
     let celsius = |printer: &Printer| printer.probe().heater("chamber").unwrap().celsius;
     printer.gcode("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=exhaust TARGET=80\nG4 P3000");
@@ -65,13 +63,12 @@ fn klippy_cools_a_chamber_by_its_fan() {
 #[test]
 fn klippy_mixes_the_colours_of_a_light() {
     let Some(checkout) = checkout("klippy_mixes_the_colours_of_a_light") else { return };
-    let describe = |board: String, _: &Path| example(&board, "An RGBW strip");
-    let mut printer = Printer::start_shown(&checkout, describe, |config| config);
-    printer.until_state("ready");
+    let describe = |board: String| example(&board, "An RGBW strip");
+    let mut printer = Printer::start_on(&checkout, describe, |config| config);
     assert!(!printer.log().contains("WARN"), "{}", printer.log());
-    printer.until_shown("shelf", |shelf| shelf == "off");
+    assert_eq!(printer.sight("shelf").to_string(), "off");
     printer.gcode("SET_LED LED=shelf RED=1 GREEN=0.2 WHITE=0.6");
-    printer.until_shown("shelf", |shelf| shelf == "red#ff3300+99");
+    assert_eq!(printer.sight("shelf").to_string(), "#ff3300+99");
     printer.gcode("SET_LED LED=shelf BLUE=1");
-    printer.until_shown("shelf", |shelf| shelf == "blue#0000ff");
+    assert_eq!(printer.sight("shelf").to_string(), "#0000ff");
 }

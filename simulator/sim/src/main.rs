@@ -23,7 +23,6 @@ use printer::SimArgs;
 mod attempt;
 mod boards;
 mod camera;
-mod clock;
 mod demo;
 mod description;
 mod own;

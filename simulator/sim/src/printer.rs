@@ -20,6 +20,7 @@ use pinion_client::Client;
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::time::Ticks;
+use pinion_host::{OneClock, Time};
 use pinion_linux::clock::Monotonic;
 use pinion_model::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 use pinion_printer_config::Trouble;
@@ -27,11 +28,9 @@ use pinion_runtime::klippy::Checkout;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 
-use crate::attempt::time::Time;
-use crate::attempt::{self, Attempt, Form, Task};
+use crate::attempt::{self, Attempt, Form, Task, Watching};
 use crate::boards::{self, Others};
 use crate::camera::{self, Camera};
-use crate::clock::{self, OneClock};
 use crate::description::read;
 use crate::own;
 use crate::own::args::OwnArgs;
@@ -104,7 +103,7 @@ impl Owner {
     fn new(args: &SimArgs, own: Own) -> Result<Owner, Trouble> {
         let attempt = args.own.attempt()?;
         let is_in_one_clock = attempt.as_ref().is_some_and(|attempt| !attempt.real_time);
-        let link = is_in_one_clock.then(|| PathBuf::from(format!("{}mcu", clock::MCUS)));
+        let link = is_in_one_clock.then(|| PathBuf::from(format!("{}mcu", pinion_host::MCUS)));
         let place = Place::make(&own, &args.own, link.as_deref().or(args.symlink.as_deref()))?;
         Ok(Owner { own, place, printer_cfg: args.file.clone().unwrap_or_default(), attempt })
     }
@@ -266,7 +265,7 @@ fn run_in_one_clock(
     };
     let mut record = None;
     let tried = || {
-        let clock = clock::clock();
+        let clock = pinion_host::start();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
         let forms = Checkout::read(&attempt.klipper.join("klippy"), FEATURES)
@@ -281,16 +280,20 @@ fn run_in_one_clock(
         if let Some(trace) = spi_trace {
             probe.record_spi(trace.make()?);
         }
+        let mut toolpath = None;
         if let Some(files) = path {
             let path = PathRecord::new(files, probe.clone());
-            one.watch(path.reader());
+            toolpath = Some(Box::new(path.reader()) as Box<dyn FnMut()>);
             record = Some(path);
         }
+        let watching = Watching::new(attempt.form, probe.clone(), toolpath);
         let time = Time::One(Box::new(one));
         let done = match &attempt.task {
-            Task::Try => attempt::run(attempt, own, folder, &probe, time, &ended),
-            Task::Print(print) => attempt::print::run(attempt, print, own, folder, &probe, time, &ended)?,
-            Task::Serve(_) => attempt::paced::run(attempt, (folder, &owner.printer_cfg), &probe, time, &shown, &ended)?,
+            Task::Try => attempt::run(attempt, own, folder, &probe, (time, watching), &ended),
+            Task::Print(print) => attempt::print::run(attempt, print, own, folder, &probe, (time, watching), &ended)?,
+            Task::Serve(_) => {
+                attempt::paced::run(attempt, (folder, &owner.printer_cfg), (time, watching), &shown, &ended)?
+            }
         };
         match (done, &attempt.task) {
             (Some(passed), _) => Ok(passed),
@@ -425,7 +428,9 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
         }
         if let Place::Folder(folder) = &owner.place {
             let time = Time::Real(Instant::now(), ended.clone());
-            let passed = attempt::run(&attempt, (&owner.own, &owner.printer_cfg), folder, &probe, time, &ended);
+            let watching = Watching::new(attempt.form, probe.clone(), None);
+            let of_owner = (&owner.own, owner.printer_cfg.as_path());
+            let passed = attempt::run(&attempt, of_owner, folder, &probe, (time, watching), &ended);
             right.store(passed == Some(true), Ordering::SeqCst);
         }
         end();

@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim PRINTER.CFG --try`: a klippy on the user's configuration does what every owner does after a change.
 
-mod host;
 pub(crate) mod paced;
 pub(crate) mod place;
 pub(crate) mod print;
 mod report;
 pub(crate) mod rights;
 mod steps;
-pub(crate) mod time;
 mod trial;
+mod watching;
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -18,18 +17,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::builder::PossibleValuesParser;
+use pinion_host::{Launch, NoStart, Running, Time};
 use pinion_model::SimProbe;
 use pinion_printer_config::{Place, Trouble};
 
 use crate::own::serve::{Folder, Own};
-pub(crate) use host::Running;
-use host::{Host, NoStart};
 use print::PrintOptions;
 pub(crate) use report::Form;
 use report::{Outcome, Report};
 use steps::STEPS;
-use time::Time;
 use trial::Trial;
+pub(crate) use watching::{Host, Watching};
 
 /// What klippy does on the printer.
 #[derive(Clone, Debug)]
@@ -59,6 +57,20 @@ pub(crate) struct Attempt {
     pub(crate) running: Running,
 }
 
+impl Attempt {
+    /// A klippy on the copy in a folder.
+    fn launch<'a>(&'a self, folder: &'a Folder) -> Launch<'a> {
+        Launch {
+            klipper: &self.klipper,
+            python: &self.python,
+            folder: &folder.path,
+            printer_cfg: &folder.printer_cfg,
+            command: rights::confined(),
+            running: self.running.clone(),
+        }
+    }
+}
+
 /// Tries a printer. Returns whether nothing failed, or nothing if klippy takes no part in the printer's clock. `ended` is
 /// set when the program is asked to end.
 pub(crate) fn run(
@@ -66,12 +78,12 @@ pub(crate) fn run(
     (own, printer): (&Own, &Path),
     folder: &Folder,
     probe: &SimProbe,
-    time: Time,
+    (time, watching): (Time, Watching),
     ended: &AtomicBool,
 ) -> Option<bool> {
     let mut report = Report::new(attempt.form);
     let began = time.now();
-    let host = match Host::start(attempt, folder, probe, time) {
+    let host = match Host::start(attempt.launch(folder), time, watching) {
         Ok(host) => host,
         Err(NoStart::Alone) => return None,
         Err(_) if ended.load(Ordering::SeqCst) => return Some(false),
@@ -91,7 +103,7 @@ pub(crate) fn run(
         }
         let since = if step.name == "ready" { began } else { trial.host.now() };
         let now = trial.host.now();
-        trial.host.progress.begin(step.name, now);
+        trial.host.watch.progress.begin(step.name, now);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
             None => trial.tried(step),

@@ -7,14 +7,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use pinion::page::Page;
-use pinion_model::SimProbe;
+use pinion_host::{NoStart, Stop, Time};
 use pinion_printer_config::Trouble;
 
-use super::Attempt;
-use super::host::{Host, NoStart};
 use super::report::show;
-use super::time::Time;
-use crate::clock::Stop;
+use super::{Attempt, Host, Watching};
 use crate::own::serve::Folder;
 use crate::own_status::OwnStatus;
 
@@ -30,12 +27,11 @@ const LOOK: Duration = Duration::from_millis(200);
 pub(crate) fn run(
     attempt: &Attempt,
     (folder, printer): (&Folder, &Path),
-    probe: &SimProbe,
-    time: Time,
+    (time, watching): (Time, Watching),
     shown: &OwnStatus,
     ended: &AtomicBool,
 ) -> Result<Option<bool>, Trouble> {
-    let mut host = match Host::start(attempt, folder, probe, time) {
+    let mut host = match Host::start(attempt.launch(folder), time, watching) {
         Ok(host) => host,
         Err(NoStart::Alone) => return Ok(None),
         Err(NoStart::Trouble(trouble)) => return Err(trouble),

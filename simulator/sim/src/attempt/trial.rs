@@ -4,15 +4,15 @@
 use std::fs;
 use std::time::Duration;
 
+use pinion_host::{NoStart, Refused};
 use pinion_model::{Recorder, SimProbe, write_svg};
 use pinion_printer_config::{Config, Place, Section, Trouble};
 use serde_json::Value;
 
-use super::host::{Host, NoStart, Refused};
 use super::place::place_of;
 use super::report::Outcome;
 use super::steps::{Step, is_first};
-use super::{Attempt, unwritten};
+use super::{Attempt, Host, unwritten};
 use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
 
@@ -134,10 +134,7 @@ impl<'a> Trial<'a> {
 
     /// Starts another klippy. One that stopped while it homed does not take a FIRMWARE_RESTART.
     fn restart(&mut self) -> Result<(), NoStart> {
-        self.host.end();
-        let time = self.host.take_time();
-        self.host = Host::start(self.attempt, self.folder, self.probe, time)?;
-        Ok(())
+        self.host.start_anew(self.attempt.launch(self.folder))
     }
 
     /// After a failure: goes on if klippy is ready, or is so after a restart.
@@ -178,7 +175,7 @@ impl<'a> Trial<'a> {
     fn until_ready_again(&mut self) -> Result<(), String> {
         match self.until_ready() {
             Err(words) if words.contains("is shutdown") => {
-                self.host.firmware_restart();
+                self.host.restart("FIRMWARE_RESTART");
                 self.until_ready()
             }
             ready => ready,

@@ -7,7 +7,8 @@ use clap::Args;
 
 use super::Pace;
 use crate::attempt::print::PrintOptions;
-use crate::attempt::{self, Attempt, Form, Running, Task};
+use crate::attempt::{self, Attempt, Form, Task};
+use pinion_host::Running;
 use pinion_printer_config::Trouble;
 
 /// Options for a printer.cfg.

@@ -15,16 +15,15 @@ use std::time::{Duration, Instant};
 
 use pinion::page::Page;
 use pinion_firmware::time::CLOCK_FREQ;
+use pinion_host::{NoStart, Time};
 use pinion_model::{AskedPath, PathPoint, SimProbe, compare};
 use pinion_printer_config::{Config, Trouble};
 use pinion_system::files::Output;
 use serde_json::{Value, json};
 
-use super::host::{Host, NoStart};
 use super::report::show;
-use super::time::Time;
 use super::trial::homes_by_stall;
-use super::{Attempt, Form, unwritten};
+use super::{Attempt, Form, Host, Watching, unwritten};
 use crate::own::serve::{Folder, Own};
 use file::GcodeFile;
 use phase::{Phase, Sight};
@@ -83,7 +82,7 @@ pub(crate) fn run(
     (own, printer): (&Own, &Path),
     folder: &Folder,
     probe: &SimProbe,
-    time: Time,
+    (time, watching): (Time, Watching),
     ended: &AtomicBool,
 ) -> Result<Option<bool>, Trouble> {
     let plot = options.plot.as_deref().map(|path| Output::check(path, &[printer, &options.file])).transpose();
@@ -91,7 +90,7 @@ pub(crate) fn run(
     let file = GcodeFile::read(&options.file)?;
     let began = Instant::now();
     offer(&file, own, folder)?;
-    let host = match Host::start(attempt, folder, probe, time) {
+    let host = match Host::start(attempt.launch(folder), time, watching) {
         Ok(host) => host,
         Err(NoStart::Alone) => return Ok(None),
         Err(NoStart::Trouble(trouble)) => return Err(trouble),
@@ -110,7 +109,7 @@ pub(crate) fn run(
     };
     let printed = printing.run();
     let took = began.elapsed();
-    printing.host.progress.end();
+    printing.host.watch.progress.end();
     if ended.load(Ordering::SeqCst) {
         return Ok(Some(false));
     }
@@ -170,11 +169,11 @@ struct Print<'a> {
 
 impl Print<'_> {
     fn run(&mut self) -> Printed {
-        self.host.progress.begin(&self.file.name(), self.host.now());
+        self.host.watch.progress.begin(&self.file.name(), self.host.now());
         let before: Vec<u64> = self.probe.axes().map(|axis| axis.lost_steps).collect();
         let ready = self.host.until_ready(READY);
-        self.host.recorder = Some(self.probe.recorder());
-        self.host.paces = Some(self.probe.paces());
+        self.host.watch.recorder = Some(self.probe.recorder());
+        self.host.watch.paces = Some(self.probe.paces());
         let began = self.host.now();
         let stopped = match ready {
             Ok(()) => self.follow(began).err(),
@@ -205,7 +204,7 @@ impl Print<'_> {
             phases: phases.to_vec(),
             layers: layers(&points),
             filament_mm: points.iter().map(|point| f64::from(point.laid_mm)).sum(),
-            motors: self.host.paces.take().map_or_else(Vec::new, |paces| paces.most().cloned().collect()),
+            motors: self.host.watch.paces.take().map_or_else(Vec::new, |paces| paces.most().cloned().collect()),
             heaters: self.heaters.clone(),
             compared,
             lost,
@@ -226,7 +225,7 @@ impl Print<'_> {
 
     /// The path that was recorded, and why it is not the whole one.
     fn path(&mut self) -> (Vec<PathPoint>, Option<String>) {
-        let Some(mut recorder) = self.host.recorder.take() else { return (Vec::new(), None) };
+        let Some(mut recorder) = self.host.watch.recorder.take() else { return (Vec::new(), None) };
         recorder.end(self.probe.now());
         let trouble = match recorder.gaps() {
             _ if recorder.is_full() => Some("the path was too long, so its end is missing".to_owned()),
@@ -307,12 +306,12 @@ impl Print<'_> {
         let mm_per_s = number("motion_report", "live_velocity");
         let filament_mm_per_s = number("motion_report", "live_extruder_velocity");
         let homed = status["toolhead"]["homed_axes"].as_str().unwrap_or_default();
-        let point = self.host.recorder.as_ref().and_then(|recorder| recorder.points().last());
+        let point = self.host.watch.recorder.as_ref().and_then(|recorder| recorder.points().last());
         let has_begun = point.is_some_and(|point| point.layer > 0);
         if has_begun && !self.has_begun {
             // Homing and probing stop abruptly, as no print does.
             self.has_begun = true;
-            self.host.paces = Some(self.probe.paces());
+            self.host.watch.paces = Some(self.probe.paces());
         }
         let sight = Sight {
             line: &self.file.text(self.line),
@@ -334,7 +333,7 @@ impl Print<'_> {
         let share = number("virtual_sdcard", "progress").clamp(0.0, 1.0);
         let full = (share * BAR as f64) as usize;
         let bar = format!(" [{}{}] {:.0} %", "#".repeat(full), "-".repeat(BAR - full), share * 100.0);
-        self.host.progress.say(bar);
+        self.host.watch.progress.say(bar);
     }
 }
 

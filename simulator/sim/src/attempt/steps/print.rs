@@ -11,9 +11,9 @@ use super::heaters::heat_extruder;
 use super::homing::said_mm;
 use super::square::{LAYER_MM, square};
 use super::{Seen, skipped};
-use crate::attempt::host::Refused;
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial, travel};
+use pinion_host::Refused;
 
 /// How long a print may take.
 const PRINT: Duration = Duration::from_secs(4 * 3600);
@@ -112,10 +112,10 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
 
 /// Records the path of the nozzle while a print runs. Returns the print's result, too.
 fn recorded<T>(trial: &mut Trial<'_>, print: impl FnOnce(&mut Trial<'_>) -> T) -> Result<(T, Recorder), Outcome> {
-    trial.host.recorder = Some(trial.probe.recorder());
+    trial.host.watch.recorder = Some(trial.probe.recorder());
     let printed = print(trial);
     trial.sleep(Duration::from_millis(600));
-    let Some(mut recorder) = trial.host.recorder.take() else {
+    let Some(mut recorder) = trial.host.watch.recorder.take() else {
         return Err(trial.failed("the path was not recorded", None));
     };
     recorder.end(trial.probe.now());

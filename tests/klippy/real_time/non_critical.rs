@@ -8,8 +8,9 @@ use std::process::{Child, Command, Stdio};
 use pinion_firmware::mcu::DialectName;
 use pinion_testkit::wait;
 
-use super::hosts;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, pinion_path, without};
+use super::Printer;
+use crate::hosts;
+use crate::klippy::{UNHOMED, WHERE_IT_STANDS, pinion_path, without};
 
 /// Another Pinion, which is no part of the printer.
 struct Room(Child);

@@ -16,7 +16,7 @@ use pinion_linux::clock::poll_timeout;
 use crate::clock::{OneClock, Stop};
 
 /// The clock of a trial.
-pub(crate) enum Time {
+pub enum Time {
     /// Both have one clock.
     One(Box<OneClock>),
     /// The computer's. The flag is set when the program is asked to end.
@@ -25,7 +25,7 @@ pub(crate) enum Time {
 
 impl Time {
     /// Time since some instant.
-    pub(crate) fn now(&self) -> Duration {
+    pub fn now(&self) -> Duration {
         match self {
             Time::One(clock) => clock.now(),
             Time::Real(since, _) => since.elapsed(),

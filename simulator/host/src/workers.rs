@@ -14,7 +14,7 @@ const JOBS_MAX: usize = 1024;
 
 /// The buses. Clones are the same ones: the MCU has one, and its owner asks for the next end.
 #[derive(Clone)]
-pub(super) struct Buses {
+pub(crate) struct Buses {
     clock: Arc<dyn TimeSource>,
     all: Arc<Mutex<Vec<Bus>>>,
 }
@@ -48,7 +48,7 @@ impl Bus {
 }
 
 impl Buses {
-    pub(super) fn new(clock: Arc<dyn TimeSource>) -> Buses {
+    pub(crate) fn new(clock: Arc<dyn TimeSource>) -> Buses {
         Buses { clock, all: Arc::default() }
     }
 
@@ -57,7 +57,7 @@ impl Buses {
     }
 
     /// When the next job is back.
-    pub(super) fn next_end(&self) -> Option<Clock> {
+    pub(crate) fn next_end(&self) -> Option<Clock> {
         self.all().iter().filter_map(Bus::end).min()
     }
 }

@@ -15,7 +15,7 @@ use pinion_protocol::block::{Received, Receiver, frame};
 use pinion_protocol::vlq;
 use pinion_runtime::FIRMWARE;
 
-use super::workers::Buses;
+use crate::workers::Buses;
 
 /// Highest number of bytes that wait for an MCU that is busy.
 const INPUT_BYTES_MAX: usize = 1 << 16;
@@ -26,6 +26,10 @@ const OUTPUT_BYTES_MAX: usize = 1 << 20;
 /// output for 0.2 s later, and `[controller_fan]` sets one anew 0.1 s after that start, for 0.1 s later. klippy sends that
 /// only after the first time has come, which is too late if the start takes no time at all.
 const CONFIGURES: Ticks = Ticks::from_ms(50);
+
+/// How long bytes are under way to an MCU. klippy counts on some time: it estimates the clock of a TLE5012B from two
+/// answers in a row, and that estimate leads astray if they are less than 0.1 ms apart.
+const LINK: Ticks = Ticks::from_us(500);
 
 /// What the MCU sends.
 #[derive(Clone, Default)]
@@ -56,6 +60,8 @@ impl Outbox for Responses {
 struct Connection {
     stream: UnixStream,
     receiver: Receiver,
+    /// What klippy has sent, and when it arrives.
+    under_way: VecDeque<(Clock, Vec<u8>)>,
     input: Vec<u8>,
     /// The block that is under way, and the offset of its next command.
     block: Option<(Vec<u8>, usize)>,
@@ -65,7 +71,7 @@ struct Connection {
 }
 
 /// An MCU and its klippy.
-pub(super) struct BoardMcu {
+pub(crate) struct BoardMcu {
     mcu: Mcu,
     clock: Arc<dyn TimeSource>,
     buses: Buses,
@@ -78,7 +84,7 @@ pub(super) struct BoardMcu {
 
 impl BoardMcu {
     /// The MCU of a board, for a klippy whose sources look up these forms. klippy connects to `socket`.
-    pub(super) fn new(board: SimBoard, forms: Forms, socket: &Path) -> Result<BoardMcu, Trouble> {
+    pub(crate) fn new(board: SimBoard, forms: Forms, socket: &Path) -> Result<BoardMcu, Trouble> {
         let failed = |cause: String| Trouble::new(cause).of(format_args!("the MCU {}", board.name()));
         let dialect = Dialect::new(&FIRMWARE, &board, forms).map_err(|error| failed(error.to_string()))?;
         let listener = UnixListener::bind(socket)
@@ -93,48 +99,63 @@ impl BoardMcu {
     }
 
     /// Another process of klippy comes.
-    pub(super) fn renew(&mut self) {
+    pub(crate) fn renew(&mut self) {
         self.connection = None;
         self.mcu.renew();
     }
 
     /// When something happens next, in nanoseconds of the printer's time.
-    pub(super) fn next_ns(&self) -> u64 {
+    pub(crate) fn next_ns(&self) -> u64 {
         let rests = Some(self.rests_until).filter(|until| *until > self.clock.now());
-        let next = self.mcu.next_timer().into_iter().chain(self.buses.next_end()).chain(rests).min();
+        let arrives = self.connection.as_ref().and_then(|connection| connection.under_way.front());
+        let arrives = arrives.map(|(at, _)| *at);
+        let next = self.mcu.next_timer().into_iter().chain(self.buses.next_end()).chain(rests).chain(arrives).min();
         next.map_or(u64::MAX, |next| self.clock.duration_of(next).as_nanos() as u64)
     }
 
     /// Does everything that is due. Returns whether klippy has something to read.
-    pub(super) fn turn(&mut self) -> bool {
+    pub(crate) fn turn(&mut self) -> bool {
+        if let Some(connection) = &mut self.connection {
+            connection.arrive(self.clock.now());
+        }
         loop {
             while self.mcu.run_timers() {}
             self.mcu.run_workers();
             let ran = self.run_commands();
             if !ran && !self.mcu.has_completion() {
                 let has_sent = self.give_out();
-                self.connection.take_if(|connection| connection.is_over && connection.block.is_none());
+                self.connection.take_if(|connection| {
+                    connection.is_over && connection.block.is_none() && connection.under_way.is_empty()
+                });
                 return has_sent;
             }
         }
     }
 
     /// Takes in what klippy has sent.
-    pub(super) fn take_in(&mut self) {
+    pub(crate) fn take_in(&mut self) {
         if let Ok((stream, _)) = self.listener.accept() {
             // It fails for no socket.
             let _ = stream.set_nonblocking(true);
-            let (receiver, input, output) = (Receiver::default(), Vec::new(), Vec::new());
-            self.connection = Some(Connection { stream, receiver, input, block: None, output, is_over: false });
+            self.connection = Some(Connection {
+                stream,
+                receiver: Receiver::default(),
+                under_way: VecDeque::new(),
+                input: Vec::new(),
+                block: None,
+                output: Vec::new(),
+                is_over: false,
+            });
             self.responses.all().clear();
         }
         let Some(connection) = &mut self.connection else { return };
         let mut piece = [0; 4096];
-        while connection.input.len() < INPUT_BYTES_MAX {
+        let arrives = self.clock.now() + LINK;
+        while connection.under_way.len() * piece.len() + connection.input.len() < INPUT_BYTES_MAX {
             match connection.stream.read(&mut piece) {
                 // What has come before the end still counts.
                 Ok(0) => return connection.is_over = true,
-                Ok(read) => connection.input.extend_from_slice(&piece[..read]),
+                Ok(read) => connection.under_way.push_back((arrives, piece[..read].to_vec())),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
                 Err(_) => return self.connection = None,
@@ -216,6 +237,12 @@ impl BoardMcu {
 }
 
 impl Connection {
+    /// Takes in what has come by now.
+    fn arrive(&mut self, now: Clock) {
+        let count = self.under_way.iter().take_while(|(at, _)| *at <= now).count();
+        self.under_way.drain(..count).for_each(|(_, bytes)| self.input.extend(bytes));
+    }
+
     /// Frames responses. Each has the number after the block that is under way, or after the last one.
     fn frame_all(&mut self, responses: &Responses) {
         for payload in responses.all().drain(..) {

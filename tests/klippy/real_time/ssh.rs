@@ -10,9 +10,10 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, geteuid};
 
-use super::checkout;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, pinion_path, python};
+use super::Printer;
 use super::links::print_a_while;
+use crate::checkout;
+use crate::klippy::{UNHOMED, WHERE_IT_STANDS, pinion_path, python};
 
 /// A child that ends with its test.
 struct Running(Child);

@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
 
+use super::Printer;
 use crate::checkout;
-use crate::klippy::Printer;
 
 /// One byte in so many is lost.
 const LOST: usize = 20_011;

@@ -9,7 +9,7 @@ use std::os::fd::AsRawFd as _;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
@@ -20,13 +20,10 @@ use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
-use super::report::Progress;
-use super::time::Time;
-use super::{Attempt, rights};
+use pinion_firmware::trouble::Trouble;
+
 use crate::clock::{self, LIBRARY, Stop};
-use crate::own::serve::Folder;
-use pinion_model::{PaceWatch, Recorder, SimProbe};
-use pinion_printer_config::Trouble;
+use crate::time::Time;
 
 /// The end of a message.
 const END: u8 = 3;
@@ -47,12 +44,12 @@ const FIRST_MOMENTS: Duration = Duration::from_secs(3);
 const END_TIME: Duration = Duration::from_secs(3);
 /// Time between two looks at an API that is not there yet.
 const LOOK_FOR_API: Duration = Duration::from_millis(50);
-/// Time between two reads of the path. The printer keeps half a second of an axis at 32,000 steps per second.
-const READ_PATH: Duration = Duration::from_millis(50);
+/// Time between two calls of a watch. The printer keeps half a second of an axis at 32,000 steps per second.
+const WATCH: Duration = Duration::from_millis(50);
 
 /// The result of a command.
 #[derive(Debug)]
-pub(super) enum Refused {
+pub enum Refused {
     /// klippy refused it, in its words.
     Error(String),
     /// It took too long.
@@ -78,11 +75,17 @@ impl From<Stop> for Refused {
 }
 
 /// Why klippy did not start.
-pub(super) enum NoStart {
+pub enum NoStart {
     /// It takes no part in the printer's clock: its Python loads no library.
     Alone,
     /// Anything else.
     Trouble(Trouble),
+}
+
+impl From<Refused> for NoStart {
+    fn from(refused: Refused) -> NoStart {
+        NoStart::Trouble(Trouble::new(format!("klippy's API does not answer: {refused}")))
+    }
 }
 
 impl From<Trouble> for NoStart {
@@ -93,11 +96,11 @@ impl From<Trouble> for NoStart {
 
 /// The number of the process that this program started, so that nothing of it stays when the program ends.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Running(Arc<AtomicI32>);
+pub struct Running(Arc<AtomicI32>);
 
 impl Running {
     /// Ends it, if it runs.
-    pub(crate) fn end(&self) {
+    pub fn end(&self) {
         // A process that nobody has waited for keeps its number.
         let pid = self.0.swap(0, Ordering::SeqCst);
         if pid != 0 {
@@ -106,8 +109,34 @@ impl Running {
     }
 }
 
+/// Is called now and then while time passes.
+pub trait Watch {
+    /// Looks at the printer, at this time of the clock.
+    fn look(&mut self, now: Duration);
+}
+
+impl Watch for () {
+    fn look(&mut self, _: Duration) {}
+}
+
+/// The klippy that is started.
+pub struct Launch<'a> {
+    /// A checkout of Klipper or Kalico.
+    pub klipper: &'a Path,
+    /// Its Python.
+    pub python: &'a Path,
+    /// Where its logs, its API and its terminal are.
+    pub folder: &'a Path,
+    /// Its configuration.
+    pub printer_cfg: &'a Path,
+    /// A command that runs the program of its arguments, with the rights that klippy shall have.
+    pub command: Command,
+    /// Gets klippy's process.
+    pub running: Running,
+}
+
 /// A klippy.
-pub(super) struct Host {
+pub struct Host<W> {
     child: Child,
     running: Running,
     socket: PathBuf,
@@ -117,143 +146,53 @@ pub(super) struct Host {
     /// Answers to other questions than the one that is waited for.
     answers: HashMap<u64, Value>,
     /// klippy's output since the last command.
-    pub(super) said: Vec<String>,
-    pub(super) time: Time,
-    /// Records the nozzle's path while time passes.
-    pub(super) recorder: Option<Recorder>,
-    /// Watches how fast the motors are.
-    pub(super) paces: Option<PaceWatch>,
-    pub(super) progress: Progress,
-    probe: SimProbe,
+    pub said: Vec<String>,
+    time: Time,
+    /// Looks at the printer while time passes.
+    pub watch: W,
 }
 
-impl Host {
-    /// Starts a klippy on the copy in a folder.
+impl<W: Watch> Host<W> {
+    /// Starts a klippy.
     ///
     /// # Errors
     ///
     /// It cannot be started, does not take part in the clock, or opens no API.
-    pub(super) fn start(attempt: &Attempt, folder: &Folder, probe: &SimProbe, mut time: Time) -> Result<Host, NoStart> {
-        let Attempt { klipper, python, running, .. } = attempt;
-        let program = klipper.join("klippy/klippy.py");
-        let failed = |cause: String| Trouble::new(cause).of(program.display());
-        if !program.is_file() {
-            let trouble = failed("there is no klippy".into());
-            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR").into());
-        }
-        let socket = folder.path.join("klippy.sock");
-        let _ = std::fs::remove_file(&socket);
-        let output = File::create(folder.path.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
-        let mut command = rights::confined();
-        let turns = match &mut time {
-            Time::Real(..) => None,
-            // The library is for 64 bits.
-            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
-            Time::One(clock) => {
-                let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
-                // What follows env, and nothing before it, has the library.
-                let library = library()?;
-                let opened = File::open(&library).and_then(|file| {
-                    fcntl(&file, FcntlArg::F_SETFD(FdFlag::empty()))?;
-                    Ok(file)
-                });
-                let file = opened.map_err(|error| failed(format!("{}: {error}", library.display())))?;
-                // By its descriptor: the loader takes a space or a colon in a path for the end of it.
-                command.arg("env").arg(format!("LD_PRELOAD=/proc/self/fd/{}", file.as_raw_fd()));
-                command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, &folder.path)));
-                // The same order of names in each run; one thread for numpy.
-                command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
-                Some((ours, theirs, file))
-            }
-        };
-        command.arg(python).arg(&program).arg(&folder.printer_cfg).arg("-a").arg(&socket);
-        command.arg("-l").arg(folder.path.join("klippy.log")).arg("-I").arg(folder.path.join("klippy.tty"));
-        command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
-        // A Ctrl-C ends this program, which ends klippy.
-        let started = command.stderr(output).process_group(0).spawn();
-        let mut child = started.map_err(|error| {
-            failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
-        })?;
-        running.0.store(child.id().cast_signed(), Ordering::SeqCst);
-        let opened = Host::await_api(&mut child, &mut time, turns.map(|(ours, ..)| ours), &socket, folder);
-        let api = opened.inspect_err(|_| {
-            running.0.store(0, Ordering::SeqCst);
-            let _ = child.kill();
-            let _ = child.wait();
-        });
-        let api = api.map_err(|error| match error {
-            NoStart::Trouble(trouble) => NoStart::Trouble(trouble.of(program.display())),
-            NoStart::Alone => NoStart::Alone,
-        })?;
+    pub fn start(launch: Launch<'_>, mut time: Time, watch: W) -> Result<Host<W>, NoStart> {
+        let running = launch.running.clone();
+        let Started { child, socket, api } = Started::new(launch, &mut time)?;
         let (buffer, answers, said) = (Vec::new(), HashMap::new(), Vec::new());
-        let running = running.clone();
-        let (recorder, paces, progress, probe) = (None, None, Progress::new(attempt.form), probe.clone());
-        let mut host = Host {
-            child,
-            running,
-            socket,
-            api,
-            buffer,
-            next_id: 0,
-            answers,
-            said,
-            time,
-            recorder,
-            paces,
-            progress,
-            probe,
-        };
-        let subscribed = host.subscribe();
-        match subscribed {
-            Ok(()) => Ok(host),
-            Err(refused) => Err(failed(format!("its API does not answer: {refused:?}")).into()),
-        }
+        let mut host = Host { child, running, socket, api, buffer, next_id: 0, answers, said, time, watch };
+        host.subscribe()?;
+        Ok(host)
     }
 
-    /// Waits until klippy takes part in the clock and has opened its API.
-    fn await_api(
-        child: &mut Child,
-        time: &mut Time,
-        turns: Option<UnixStream>,
-        socket: &Path,
-        folder: &Folder,
-    ) -> Result<UnixStream, NoStart> {
-        if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
-            match clock.await_player(turns) {
-                Ok(()) => {}
-                Err(Stop::Computes) => return Err(NoStart::Alone),
-                Err(_) => return Err(no_start(&folder.path, true).into()),
-            }
-        }
-        let until = time.now() + START;
-        loop {
-            if let Ok(api) = UnixStream::connect(socket) {
-                return Ok(api);
-            }
-            let passed = time.sleep(LOOK_FOR_API);
-            let ended = passed.is_err() || child.try_wait().ok().flatten().is_some();
-            if ended || time.now() > until {
-                return Err(no_start(&folder.path, ended).into());
-            }
-        }
-    }
-
-    /// Gives the clock away, for another klippy.
-    pub(super) fn take_time(&mut self) -> Time {
-        std::mem::replace(&mut self.time, Time::Real(Instant::now(), Arc::default()))
+    /// Ends klippy and starts another one in the same clock.
+    ///
+    /// # Errors
+    ///
+    /// As of [`Host::start`].
+    pub fn start_anew(&mut self, launch: Launch<'_>) -> Result<(), NoStart> {
+        self.end();
+        let Started { child, socket, api } = Started::new(launch, &mut self.time)?;
+        (self.child, self.socket, self.api) = (child, socket, api);
+        self.buffer.clear();
+        self.answers.clear();
+        Ok(self.subscribe()?)
     }
 
     /// klippy's process.
-    pub(super) fn pid(&self) -> u32 {
+    pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
     /// Whether klippy runs.
-    pub(super) fn is_there(&mut self) -> bool {
+    pub fn is_there(&mut self) -> bool {
         matches!(self.child.try_wait(), Ok(None))
     }
 
-    pub(super) fn now(&self) -> Duration {
+    /// The time of the clock.
+    pub fn now(&self) -> Duration {
         self.time.now()
     }
 
@@ -262,10 +201,10 @@ impl Host {
     /// # Errors
     ///
     /// klippy takes no more turns.
-    pub(super) fn sleep(&mut self, span: Duration) -> Result<(), Stop> {
+    pub fn sleep(&mut self, span: Duration) -> Result<(), Stop> {
         let until = self.now() + span;
         while self.now() < until {
-            let next = until.min(self.now() + READ_PATH);
+            let next = until.min(self.now() + WATCH);
             self.time.sleep(next.saturating_sub(self.now()))?;
             self.look();
         }
@@ -274,10 +213,7 @@ impl Host {
 
     /// Does what has to be done now and then.
     fn look(&mut self) {
-        let now = self.probe.now();
-        self.recorder.iter_mut().for_each(|recorder| recorder.read(now));
-        self.paces.iter_mut().for_each(|paces| paces.read(now));
-        self.progress.show(self.time.now());
+        self.watch.look(self.time.now());
     }
 
     /// Has klippy send its output.
@@ -286,7 +222,7 @@ impl Host {
     }
 
     /// A call of the API.
-    pub(super) fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
+    pub fn call(&mut self, method: &str, params: Value, limit: Duration) -> Result<Value, Refused> {
         let id = self.send(method, params)?;
         self.answer(id, self.now() + limit)
     }
@@ -329,6 +265,21 @@ impl Host {
         }
     }
 
+    /// Waits until klippy sends a message like this. It drops all others.
+    ///
+    /// # Errors
+    ///
+    /// None comes.
+    pub fn until_message(&mut self, is_it: impl Fn(&Value) -> bool, limit: Duration) -> Result<Value, Refused> {
+        let until = self.now() + limit;
+        loop {
+            let message = self.message(until)?;
+            if is_it(&message) {
+                return Ok(message);
+            }
+        }
+    }
+
     fn message(&mut self, until: Duration) -> Result<Value, Refused> {
         let mut piece = [0; 4096];
         loop {
@@ -340,7 +291,7 @@ impl Host {
             if self.now() >= until {
                 return Err(Refused::Late);
             }
-            let next = until.min(self.now() + READ_PATH);
+            let next = until.min(self.now() + WATCH);
             let is_there = self.time.await_bytes(&self.api, next)?;
             self.look();
             if !is_there {
@@ -359,7 +310,7 @@ impl Host {
     }
 
     /// Runs G-code to its end. A klippy that stopped may never answer, so its state is read now and then.
-    pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
+    pub fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Refused> {
         self.said.clear();
         let id = self.send("gcode/script", json!({ "script": script }))?;
         let until = self.now() + limit;
@@ -377,7 +328,7 @@ impl Host {
     }
 
     /// Waits until klippy is ready. The error is its words.
-    pub(super) fn until_ready(&mut self, limit: Duration) -> Result<(), String> {
+    pub fn until_ready(&mut self, limit: Duration) -> Result<(), String> {
         let until = self.now() + limit;
         loop {
             match self.state() {
@@ -395,14 +346,14 @@ impl Host {
     }
 
     /// klippy's state and its words about it.
-    pub(super) fn state(&mut self) -> Result<(String, String), Refused> {
+    pub fn state(&mut self) -> Result<(String, String), Refused> {
         let info = self.call("info", json!({}), ANSWER)?;
         let text = |key: &str| info[key].as_str().unwrap_or_default().to_owned();
         Ok((text("state"), text("state_message")))
     }
 
     /// The status of objects.
-    pub(super) fn query(&mut self, objects: &[&str]) -> Result<Value, Refused> {
+    pub fn query(&mut self, objects: &[&str]) -> Result<Value, Refused> {
         let objects: serde_json::Map<String, Value> =
             objects.iter().map(|name| ((*name).to_owned(), Value::Null)).collect();
         let answer = self.call("objects/query", json!({ "objects": objects }), ANSWER)?;
@@ -410,17 +361,17 @@ impl Host {
     }
 
     /// All objects of klippy.
-    pub(super) fn objects(&mut self) -> Result<Vec<String>, Refused> {
+    pub fn objects(&mut self) -> Result<Vec<String>, Refused> {
         Ok(texts(&self.call("objects/list", json!({}), ANSWER)?["objects"]))
     }
 
     /// The names of klippy's heaters.
-    pub(super) fn heaters(&mut self) -> Result<Vec<String>, Refused> {
+    pub fn heaters(&mut self) -> Result<Vec<String>, Refused> {
         Ok(texts(&self.query(&["heaters"])?["heaters"]["available_heaters"]))
     }
 
     /// Another connection, which stops the printer while a command runs.
-    pub(super) fn stop(&mut self) {
+    pub fn stop(&mut self) {
         if let Ok(mut api) = UnixStream::connect(&self.socket) {
             let _ = api.write_all(b"{\"id\":1,\"method\":\"emergency_stop\"}\x03");
             self.time.poke();
@@ -429,11 +380,11 @@ impl Host {
         }
     }
 
-    /// Has klippy reset the MCUs and restart itself.
-    pub(super) fn firmware_restart(&mut self) {
+    /// Has klippy restart itself, by RESTART or FIRMWARE_RESTART.
+    pub fn restart(&mut self, command: &str) {
         let until = self.now() + ANSWER;
         // The answer may come before the restart, or never.
-        let _ = self.gcode("FIRMWARE_RESTART", ANSWER);
+        let _ = self.gcode(command, ANSWER);
         while self.state().is_ok() && self.now() < until {
             if self.sleep(LOOK_FOR_API).is_err() {
                 break;
@@ -443,7 +394,7 @@ impl Host {
     }
 
     /// Connects again: klippy opens another API when it restarts itself. Returns whether it did.
-    pub(super) fn reconnect(&mut self) -> bool {
+    pub fn reconnect(&mut self) -> bool {
         let until = self.now() + START;
         while matches!(self.child.try_wait(), Ok(None)) && self.now() < until {
             // klippy that takes no more turns answers no more.
@@ -461,28 +412,96 @@ impl Host {
         }
         false
     }
+}
 
-    /// Ends klippy. One that hangs is killed.
-    pub(super) fn end(&mut self) {
-        let pid = self.child.id().cast_signed();
-        // Another klippy may run already.
-        let _ = self.running.0.compare_exchange(pid, 0, Ordering::SeqCst, Ordering::SeqCst);
-        // It leads a group of its own, so what it has started ends, too.
-        let group = || signal::killpg(Pid::from_raw(pid), Signal::SIGKILL);
-        if matches!(self.child.try_wait(), Ok(Some(_))) {
-            let _ = group();
-            return;
+/// A process that has opened its API.
+struct Started {
+    child: Child,
+    socket: PathBuf,
+    api: UnixStream,
+}
+
+impl Started {
+    fn new(launch: Launch<'_>, time: &mut Time) -> Result<Started, NoStart> {
+        let Launch { klipper, python, folder, printer_cfg, mut command, running } = launch;
+        let program = klipper.join("klippy/klippy.py");
+        let failed = |cause: String| Trouble::new(cause).of(program.display());
+        if !program.is_file() {
+            let trouble = failed("there is no klippy".into());
+            return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper DIR").into());
         }
-        let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
-        let until = Instant::now() + END_TIME;
-        while Instant::now() < until {
-            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
-                break;
+        let socket = folder.join("klippy.sock");
+        let _ = std::fs::remove_file(&socket);
+        let output = File::create(folder.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
+        let turns = match time {
+            Time::Real(..) => None,
+            // The library is for 64 bits.
+            Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
+            Time::One(clock) => {
+                let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
+                // What follows env, and nothing before it, has the library.
+                let library = library()?;
+                let opened = File::open(&library).and_then(|file| {
+                    fcntl(&file, FcntlArg::F_SETFD(FdFlag::empty()))?;
+                    Ok(file)
+                });
+                let file = opened.map_err(|error| failed(format!("{}: {error}", library.display())))?;
+                // By its descriptor: the loader takes a space or a colon in a path for the end of it.
+                command.arg("env").arg(format!("LD_PRELOAD=/proc/self/fd/{}", file.as_raw_fd()));
+                command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, folder)));
+                // The same order of names in each run; one thread for numpy.
+                command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
+                Some((ours, theirs, file))
             }
-            thread::sleep(Duration::from_millis(20));
+        };
+        command.arg(python).arg(&program).arg(printer_cfg).arg("-a").arg(&socket);
+        command.arg("-l").arg(folder.join("klippy.log")).arg("-I").arg(folder.join("klippy.tty"));
+        command.stdin(Stdio::null()).stdout(output.try_clone().map_err(|error| failed(error.to_string()))?);
+        // A Ctrl-C ends this program, which ends klippy.
+        let started = command.stderr(output).process_group(0).spawn();
+        let mut child = started.map_err(|error| {
+            failed(format!("{} cannot start it: {error}", python.display())).remedy("name its Python with --python")
+        })?;
+        running.0.store(child.id().cast_signed(), Ordering::SeqCst);
+        let opened = await_api(&mut child, time, turns.map(|(ours, ..)| ours), &socket, folder);
+        let api = opened.inspect_err(|_| {
+            running.0.store(0, Ordering::SeqCst);
+            let _ = child.kill();
+            let _ = child.wait();
+        });
+        let api = api.map_err(|error| match error {
+            NoStart::Trouble(trouble) => NoStart::Trouble(trouble.of(program.display())),
+            NoStart::Alone => NoStart::Alone,
+        })?;
+        Ok(Started { child, socket, api })
+    }
+}
+
+/// Waits until klippy takes part in the clock and has opened its API.
+fn await_api(
+    child: &mut Child,
+    time: &mut Time,
+    turns: Option<UnixStream>,
+    socket: &Path,
+    folder: &Path,
+) -> Result<UnixStream, NoStart> {
+    if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
+        match clock.await_player(turns) {
+            Ok(()) => {}
+            Err(Stop::Computes) => return Err(NoStart::Alone),
+            Err(_) => return Err(no_start(folder, true).into()),
         }
-        let _ = group();
-        let _ = self.child.wait();
+    }
+    let until = time.now() + START;
+    loop {
+        if let Ok(api) = UnixStream::connect(socket) {
+            return Ok(api);
+        }
+        let passed = time.sleep(LOOK_FOR_API);
+        let ended = passed.is_err() || child.try_wait().ok().flatten().is_some();
+        if ended || time.now() > until {
+            return Err(no_start(folder, ended).into());
+        }
     }
 }
 
@@ -495,8 +514,8 @@ fn texts(list: &Value) -> Vec<String> {
 fn library() -> Result<PathBuf, Trouble> {
     let program = std::env::current_exe().and_then(std::fs::canonicalize).unwrap_or_default();
     let folder = program.parent().unwrap_or(Path::new("/"));
-    // cargo's place, and the package's.
-    let places = ["deps", "../lib/pinion-sim"].map(|place| folder.join(place).join(LIBRARY));
+    // cargo's places for a program and for a test, and the package's.
+    let places = ["deps", ".", "../lib/pinion-sim"].map(|place| folder.join(place).join(LIBRARY));
     places.into_iter().find(|place| place.is_file()).ok_or_else(|| {
         Trouble::new(format!("there is no {LIBRARY} beside {}", program.display()))
             .remedy("install the whole package, or add --real-time")
@@ -526,7 +545,32 @@ fn no_start(folder: &Path, ended: bool) -> Trouble {
     Trouble::new(format!("klippy does not start: {last}")).remedy(remedy)
 }
 
-impl Drop for Host {
+impl<W> Host<W> {
+    /// Ends klippy. One that hangs is killed.
+    pub fn end(&mut self) {
+        let pid = self.child.id().cast_signed();
+        // Another klippy may run already.
+        let _ = self.running.0.compare_exchange(pid, 0, Ordering::SeqCst, Ordering::SeqCst);
+        // It leads a group of its own, so what it has started ends, too.
+        let group = || signal::killpg(Pid::from_raw(pid), Signal::SIGKILL);
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            let _ = group();
+            return;
+        }
+        let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
+        let until = Instant::now() + END_TIME;
+        while Instant::now() < until {
+            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
+                break;
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+        let _ = group();
+        let _ = self.child.wait();
+    }
+}
+
+impl<W> Drop for Host<W> {
     fn drop(&mut self) {
         self.end();
     }
