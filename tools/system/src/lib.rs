@@ -8,7 +8,7 @@
 //! - [`units`], [`manager`], [`running`]: what systemd starts, its settings, the processes
 //! - [`instance`], [`settings`], [`config`]: the Pinions, and what each was told to do
 //! - [`klippy`], [`printer`]: the klippys, and their configurations
-//! - [`device`], [`rights`], [`files`]: files in /dev, the rights of a file's owner, files that a command line names
+//! - [`device`], [`rights`], [`mod@files`]: files in /dev, the rights of a file's owner, files that a command line names
 
 #![forbid(unsafe_code)]
 // Printing panics when nobody reads. The others panic when an assumption is wrong. Tests may use all of them.
