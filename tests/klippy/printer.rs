@@ -8,11 +8,8 @@ use std::process::Command;
 use std::sync::{Arc, Once};
 use std::time::Duration;
 
-use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_host::{Host, Launch, MCUS, NoStart, OneClock, Running, Time};
 use pinion_model::{Look, SimConfig, SimProbe, SimWorld};
-use pinion_runtime::klippy::Checkout;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -105,8 +102,7 @@ impl Printer {
                 _ => format!("{MCUS}mcu_{}", board.name()).into(),
             })
             .collect();
-        let forms = Checkout::read(&checkout.join("klippy"), FEATURES)
-            .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
+        let forms = pinion_host::forms(checkout);
         let one = OneClock::new(clock, boards, (&links, folder.path()), &forms, Arc::default()).unwrap();
         let printed = Command::new(pinion_path())
             .arg("sim")

@@ -3,8 +3,8 @@
 //!
 //! Both take turns. The printer runs its MCUs in virtual time until klippy waits for something: until a time comes, or
 //! until an MCU has sent something. Then klippy has the turn until it waits again. Computing takes no time on either side,
-//! so nothing is ever late, on any computer. klippy takes part by a library (crates/klippy-clock), which has the messages
-//! of the turns.
+//! so nothing is ever late, on any computer. klippy takes part by a library (simulator/clock), which has the messages of the
+//! turns.
 
 use std::fmt::{self, Display};
 use std::io::{self, Read, Write};
@@ -16,10 +16,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::fcntl::{FcntlArg, FdFlag, fcntl};
-use pinion_firmware::mcu::Forms;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource as _, VirtualClock};
 use pinion_firmware::trouble::Trouble;
 use pinion_model::SimBoard;
+use pinion_runtime::klippy::Checkout;
 
 use crate::mcu::BoardMcu;
 
@@ -116,6 +118,12 @@ impl Pace {
         }
         until_ns.min(latest_ns)
     }
+}
+
+/// The forms that the sources of a klippy look up, or those of all hosts if they cannot be read.
+pub fn forms(klipper: &Path) -> Forms {
+    let checkout = Checkout::read(&klipper.join("klippy"), FEATURES);
+    checkout.map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms))
 }
 
 /// The clock of a printer before it runs.
@@ -350,7 +358,6 @@ pub(crate) fn word(socket: &UnixStream, folder: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::mcu::DialectName;
     use pinion_model::{SimConfig, SimWorld};
     use pinion_protocol::block::{Sequence, frame};
     use pinion_protocol::vlq::Writer;

@@ -175,10 +175,16 @@ impl<W: Watch> Host<W> {
     pub fn start_anew(&mut self, launch: Launch<'_>) -> Result<(), NoStart> {
         self.end();
         let Started { child, socket, api } = Started::new(launch, &mut self.time)?;
-        (self.child, self.socket, self.api) = (child, socket, api);
+        (self.child, self.socket) = (child, socket);
+        Ok(self.connect(api)?)
+    }
+
+    /// Uses another connection from now on.
+    fn connect(&mut self, api: UnixStream) -> Result<(), Refused> {
+        self.api = api;
         self.buffer.clear();
         self.answers.clear();
-        Ok(self.subscribe()?)
+        self.subscribe()
     }
 
     /// klippy's process.
@@ -206,14 +212,9 @@ impl<W: Watch> Host<W> {
         while self.now() < until {
             let next = until.min(self.now() + WATCH);
             self.time.sleep(next.saturating_sub(self.now()))?;
-            self.look();
+            self.watch.look(self.time.now());
         }
         Ok(())
-    }
-
-    /// Does what has to be done now and then.
-    fn look(&mut self) {
-        self.watch.look(self.time.now());
     }
 
     /// Has klippy send its output.
@@ -293,7 +294,7 @@ impl<W: Watch> Host<W> {
             }
             let next = until.min(self.now() + WATCH);
             let is_there = self.time.await_bytes(&self.api, next)?;
-            self.look();
+            self.watch.look(self.time.now());
             if !is_there {
                 continue;
             }
@@ -401,13 +402,8 @@ impl<W: Watch> Host<W> {
             if self.sleep(LOOK_FOR_API).is_err() {
                 return false;
             }
-            if let Ok(api) = UnixStream::connect(&self.socket) {
-                self.api = api;
-                self.buffer.clear();
-                self.answers.clear();
-                if self.subscribe().is_ok() {
-                    return true;
-                }
+            if UnixStream::connect(&self.socket).is_ok_and(|api| self.connect(api).is_ok()) {
+                return true;
             }
         }
         false

@@ -13,6 +13,6 @@ mod mcu;
 mod time;
 mod workers;
 
-pub use clock::{MCUS, OneClock, Stop, start};
+pub use clock::{MCUS, OneClock, Stop, forms, start};
 pub use klippy::{Host, Launch, NoStart, Refused, Running, Watch};
 pub use time::Time;

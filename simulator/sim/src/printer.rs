@@ -17,14 +17,11 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::demo::heater::Goal;
 use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
 use pinion_client::Client;
-use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{DialectName, Forms};
 use pinion_firmware::time::Ticks;
 use pinion_host::{OneClock, Time};
 use pinion_linux::clock::Monotonic;
 use pinion_model::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 use pinion_printer_config::Trouble;
-use pinion_runtime::klippy::Checkout;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
 
@@ -268,8 +265,7 @@ fn run_in_one_clock(
         let clock = pinion_host::start();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
-        let forms = Checkout::read(&attempt.klipper.join("klippy"), FEATURES)
-            .map_or(DialectName::Union.into(), |checkout| Forms::Host(checkout.forms));
+        let forms = pinion_host::forms(&attempt.klipper);
         let shown = OwnStatus::default();
         camera.map_or(Ok(()), |camera| camera.start(probe.clone(), shown.clone()))?;
         let mut one = OneClock::new(clock, boards, (owner.place.links(), &folder.path), &forms, ended.clone())?;
