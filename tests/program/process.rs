@@ -11,7 +11,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
 use pinion_client::serial::Port;
-use pinion_testkit::process::Running;
+use pinion_testkit::process::{Running, run_first};
 pub use pinion_testkit::wait::WAIT_MAX;
 use pinion_testkit::{simulator, wait};
 use tempfile::TempDir;
@@ -235,8 +235,9 @@ pub fn program() -> Command {
     program
 }
 
-/// The path of `pinion`, with `pinion-sim` beside it.
+/// The path of `pinion`, with `pinion-sim` beside it. Whoever asks for it will start it.
 pub fn pinion_path() -> &'static Path {
+    run_first();
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
     simulator::beside(pinion);
     pinion

@@ -79,7 +79,7 @@ fn from_nothing_to_a_measured_resonance_and_back() {
     let mut printer = Printer::start_on(&checkout, describe, change);
     printer.until_state("ready");
     let root = printer.path("");
-    let moonraker = Moonraker::start(Path::new(&python), &root.join("moonraker"), &printer.path("api"));
+    let moonraker = Moonraker::start(Path::new(&python), &root.join("moonraker"), &printer.path("klippy.sock"));
     fs::create_dir_all(root.join("proc/device-tree")).unwrap();
     fs::write(root.join("proc/device-tree/model"), "Raspberry Pi 4 Model B Rev 1.4\0").unwrap();
     fs::create_dir_all(root.join("boot/firmware")).unwrap();

@@ -108,7 +108,6 @@ fn klippy_prints_over_a_serial_line_that_loses_bytes() {
     let log = printer.host_log("", 0);
     let resent = log.rsplit("bytes_retransmit=").next().unwrap().split(' ').next().unwrap();
     assert!(resent.parse::<u32>().unwrap() > 0, "{resent}");
-    printer.gcode("FIRMWARE_RESTART");
-    printer.until_state("ready");
+    printer.restart("FIRMWARE_RESTART");
     printer.gcode("G28 X");
 }

@@ -10,21 +10,21 @@ mod shown;
 mod ssh;
 
 use std::fs::{self, File};
-use std::io::{Read, Write};
-use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use nix::sys::signal::{Signal, raise};
-use nix::unistd::geteuid;
+use nix::sys::signal::{Signal, kill, raise};
+use nix::unistd::Pid;
+use pinion_host::{Host, Launch, NoStart, Refused, Running, Time};
 use pinion_linux::clock::Monotonic;
 use pinion_model::{SimBoard, SimConfig, SimProbe, SimWorld};
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording};
-use serde_json::{Value, json};
+use pinion_testkit::process::run_first;
+use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::klippy::{pinion_path, python};
@@ -49,9 +49,7 @@ pub struct Printer {
     checkout: PathBuf,
     folder: TempDir,
     server: Server,
-    host: Option<Child>,
-    api: Option<UnixStream>,
-    next_id: u64,
+    host: Option<Host<()>>,
 }
 
 impl Printer {
@@ -168,7 +166,7 @@ impl Printer {
         fs::write(folder.path().join("board.toml"), board).unwrap();
         fs::write(folder.path().join("pinion.log"), "").unwrap();
         let server = serve(folder.path());
-        let mut printer = Printer { checkout: checkout.into(), folder, server, host: None, api: None, next_id: 0 };
+        let mut printer = Printer { checkout: checkout.into(), folder, server, host: None };
         printer.until("the pty", |printer| fs::read_link(printer.path("tty")).is_ok());
         printer.configure(change);
         printer.start_host();
@@ -201,113 +199,72 @@ impl Printer {
         fs::write(self.path("printer.cfg"), config).unwrap();
     }
 
+    #[track_caller]
     pub fn start_host(&mut self) {
-        let _ = fs::remove_file(self.path("api"));
-        // While it homes, klippy is a tenth of a second ahead of the MCU. On a computer that builds and tests at the
-        // same time it would often be late without this. Only root may request it.
-        let nice = if geteuid().is_root() { "-15" } else { "0" };
-        let host = Command::new("nice")
-            .args(["-n", nice])
-            .arg(python())
-            .arg(self.checkout.join("klippy/klippy.py"))
-            .arg(self.path("printer.cfg"))
-            .arg("-a")
-            .arg(self.path("api"))
-            .arg("-l")
-            .arg(self.path("klippy.log"))
-            .arg("-I")
-            .arg(self.path("input"))
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        self.host = Some(host);
-        self.until("klippy's API", |printer| UnixStream::connect(printer.path("api")).is_ok());
-        self.api = Some(UnixStream::connect(self.path("api")).unwrap());
+        // While it homes, klippy is a tenth of a second ahead of the MCU.
+        run_first();
+        let python = python();
+        let launch = Launch {
+            klipper: &self.checkout,
+            python: Path::new(&python),
+            folder: self.folder.path(),
+            printer_cfg: &self.path("printer.cfg"),
+            command: Command::new("env"),
+            running: Running::default(),
+        };
+        match Host::start(launch, Time::Real(Instant::now(), Arc::default()), ()) {
+            Ok(host) => self.host = Some(host),
+            Err(NoStart::Alone) => unreachable!("it has the computer's time"),
+            Err(NoStart::Trouble(trouble)) => panic!("{trouble}"),
+        }
     }
 
     /// kill -9.
     pub fn kill_host(&mut self) {
-        let mut host = self.host.take().unwrap();
-        host.kill().unwrap();
-        host.wait().unwrap();
+        let host = self.host.take().unwrap();
+        kill(Pid::from_raw(host.pid().cast_signed()), Signal::SIGKILL).unwrap();
     }
 
-    fn call(&mut self, method: &str, params: Value) -> Result<Value, String> {
-        self.next_id += 1;
-        let request = json!({ "id": self.next_id, "method": method, "params": params });
-        let api = self.api.as_mut().unwrap();
-        api.set_read_timeout(Some(HOST_TIMEOUT)).unwrap();
-        api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
-        loop {
-            let answer = message(api)?;
-            if answer["id"] == self.next_id {
-                return match &answer["error"] {
-                    Value::Null => Ok(answer["result"].clone()),
-                    error => Err(error.to_string()),
-                };
-            }
-        }
+    /// The running klippy.
+    fn host(&mut self) -> &mut Host<()> {
+        self.host.as_mut().unwrap()
     }
 
     /// Runs G-code to its end.
     #[track_caller]
     pub fn gcode(&mut self, script: &str) {
-        if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
+        if let Err(error) = self.try_gcode(script) {
             panic!("{script}: {error}\n{}\n{}", self.why(), self.log());
         }
     }
 
     /// Runs G-code to its end. Returns its answer, or klippy's reason for a refusal.
     pub fn try_gcode(&mut self, script: &str) -> Result<String, String> {
-        // Answers come on a separate connection, before the result.
-        let mut api = UnixStream::connect(self.path("api")).map_err(|error| error.to_string())?;
-        api.set_read_timeout(Some(HOST_TIMEOUT)).unwrap();
-        let mut ask = |id: u32, method: &str, params: Value| {
-            let request = json!({ "id": id, "method": method, "params": params });
-            api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
-            let mut answers = String::new();
-            loop {
-                let message = message(&mut api)?;
-                if let Some(line) = message["params"]["response"].as_str() {
-                    answers += line;
-                    answers.push('\n');
-                }
-                if message["id"] == id {
-                    let error = &message["error"];
-                    return if error.is_null() { Ok(answers) } else { Err(error.to_string()) };
-                }
-            }
-        };
-        ask(1, "gcode/subscribe_output", json!({ "response_template": {} }))?;
-        ask(2, "gcode/script", json!({ "script": script }))
+        let ran = self.host().gcode(script, HOST_TIMEOUT);
+        ran.map(|()| self.host().said.join("\n")).map_err(|refused| refused.to_string())
     }
 
     /// Runs G-code that stops the printer.
     pub fn stop(&mut self, script: &str) {
         // klippy may or may not answer, because it is stopped.
-        let _ = self.call("gcode/script", json!({ "script": script }));
+        let _ = self.try_gcode(script);
         self.until_state("shutdown");
     }
 
     /// Runs FIRMWARE_RESTART or RESTART and waits until klippy is ready again.
     #[track_caller]
     pub fn restart(&mut self, command: &str) {
-        let _ = self.call("gcode/script", json!({ "script": command }));
-        // klippy disconnects first.
-        thread::sleep(Duration::from_millis(500));
+        self.host().restart(command);
         self.until_state("ready");
     }
 
     pub fn state(&mut self) -> String {
-        if let Ok(info) = self.call("info", json!({})) {
-            return info["state"].as_str().unwrap_or_default().to_owned();
+        match self.host().state() {
+            Ok((state, _)) => state,
+            // A klippy that finds its MCU shut down restarts both.
+            Err(Refused::Gone(_)) if self.host().reconnect() => "startup".into(),
+            Err(refused) => panic!("klippy does not answer: {refused}\n{}", self.log()),
         }
-        match UnixStream::connect(self.path("api")) {
-            Ok(api) => self.api = Some(api),
-            Err(_) => thread::sleep(Duration::from_millis(100)),
-        }
-        "startup".into()
     }
 
     /// The final state of klippy's start.
@@ -324,8 +281,7 @@ impl Printer {
 
     /// klippy's message about its state.
     fn why(&mut self) -> String {
-        let info = self.call("info", json!({})).unwrap_or_default();
-        info["state_message"].as_str().unwrap_or_default().to_owned()
+        self.host().state().map_or_else(|refused| refused.to_string(), |(_, words)| words)
     }
 
     #[track_caller]
@@ -343,8 +299,7 @@ impl Printer {
 
     /// The status of one of klippy's objects.
     pub fn object(&mut self, name: &str) -> Value {
-        let answer = self.call("objects/query", json!({ "objects": { name: null } })).unwrap();
-        answer["status"][name].clone()
+        self.host().query(&[name]).unwrap()[name].take()
     }
 
     /// Waits until a heater is warm.
@@ -417,28 +372,14 @@ impl Printer {
     }
 }
 
-/// The next message of klippy's API.
-fn message(api: &mut UnixStream) -> Result<Value, String> {
-    let mut message = Vec::new();
-    loop {
-        let mut byte = [0];
-        api.read_exact(&mut byte).map_err(|error| error.to_string())?;
-        if byte[0] == 3 {
-            return serde_json::from_slice(&message).map_err(|error| error.to_string());
-        }
-        message.push(byte[0]);
-    }
-}
-
 impl Drop for Printer {
     fn drop(&mut self) {
-        let end = |child: &mut Child| {
-            let _ = child.kill();
-            let _ = child.wait();
-        };
-        self.host.iter_mut().for_each(end);
+        self.host = None;
         match &mut self.server {
-            Server::Program(pinion) => end(pinion),
+            Server::Program(pinion) => {
+                let _ = pinion.kill();
+                let _ = pinion.wait();
+            }
             // It handles the signal. The signal ends the printer and not this process.
             Server::Here { running, .. } => {
                 let _ = raise(Signal::SIGTERM);
