@@ -60,6 +60,23 @@ fn a_mistake_is_one_line_with_its_place_in_klippys_words() {
 }
 
 #[test]
+fn without_plugins_a_copy_does_without_the_files_of_other_programs() {
+    let (home, cfg) = folder_with("printer.cfg", &format!("[include mainsail.cfg]\n{PRINTER}"));
+    let (cfg, folder) = (cfg.to_str().unwrap(), home.path().join("sim"));
+    let (status, _, log) = output(&["sim", cfg, "--print-board"]);
+    assert_eq!(status, Some(1));
+    assert!(log.contains("printer.cfg:1: Include file '") && log.contains("mainsail.cfg' does not exist: "), "{log}");
+    let pinion = Pinion::start_in(
+        tempfile::tempdir().unwrap(),
+        &["sim", cfg, "--without-plugins", "--folder", folder.to_str().unwrap()],
+    );
+    pinion.logged("mainsail.cfg' does not exist: klippy's copy is without it");
+    pinion.wait_for_link();
+    let copy = fs::read_to_string(folder.join("printer.cfg")).unwrap();
+    assert!(copy.starts_with("# [include mainsail.cfg]\n"), "{copy}");
+}
+
+#[test]
 fn a_try_reports_a_mistake_that_is_found_before_klippy_starts() {
     let mistake = MISTAKES.iter().rfind(|mistake| !mistake.is_klippys).unwrap();
     let (_home, cfg) = folder_with("printer.cfg", &mistake.text());

@@ -97,6 +97,10 @@ fn changed(
         }
     }
     for include in config.includes.iter().filter(|include| include.place.file == *path) {
+        if include.found.is_empty() {
+            comment_out(&mut lines, include.place.line);
+            continue;
+        }
         let is_outside = |file: &Arc<Path>| places.get(file).is_some_and(|place| place.starts_with(OUTSIDE));
         let inside = places.get(path).is_some_and(|place| !place.starts_with(OUTSIDE));
         if inside && !include.found.iter().any(is_outside) {

@@ -35,8 +35,26 @@ impl Config {
     ///
     /// Those of [`Config::read`].
     pub fn read_from(files: &dyn Files, path: &Path) -> Result<Config, Trouble> {
+        Config::read_with(files, path, None).map(|(config, _)| config)
+    }
+
+    /// Reads a printer.cfg with the included files that are there. It adds a trouble for each one that is not: a copy of a
+    /// configuration may lack those of other programs.
+    ///
+    /// # Errors
+    ///
+    /// All others of [`Config::read`].
+    pub fn read_present(path: &Path) -> Result<(Config, Vec<Trouble>), Trouble> {
+        Config::read_with(&Disk, path, Some(Vec::new())).map(|(config, missing)| (config, missing.unwrap_or_default()))
+    }
+
+    fn read_with(
+        files: &dyn Files,
+        path: &Path,
+        missing: Option<Vec<Trouble>>,
+    ) -> Result<(Config, Option<Vec<Trouble>>), Trouble> {
         let (config, within) = (Config::default(), Vec::new());
-        let mut reader = Reader { files, config, within, opened: 0, bytes: 0, names_left: NAMES_MAX };
+        let mut reader = Reader { files, config, within, missing, opened: 0, bytes: 0, names_left: NAMES_MAX };
         let text = reader.text(path)?;
         let (usual, saved) = match text.find(SAVED).map(|at| text.split_at(at)) {
             Some((usual, block)) => match saved_lines(&block[SAVED.len()..]) {
@@ -54,7 +72,7 @@ impl Config {
             setting.value.truncate(setting.value.trim_end().len());
         }
         config.files.insert(0, SourceFile { path: file, text });
-        Ok(config)
+        Ok((config, reader.missing))
     }
 
     /// The text of the main file without the lines of these sections in its SAVE_CONFIG block.
@@ -119,6 +137,8 @@ struct Reader<'a> {
     config: Config,
     /// The files that are being read: each includes the next one.
     within: Vec<PathBuf>,
+    /// The included files that are not there; `None` if the first one ends the reading.
+    missing: Option<Vec<Trouble>>,
     opened: usize,
     bytes: usize,
     /// How many more names the patterns may look at.
@@ -179,9 +199,12 @@ impl Reader<'_> {
             Trouble::new(format!("Include file '{}': {error}", pattern.display())).remedy("name fewer files")
         })?;
         if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) {
-            let cause = format!("Include file '{}' does not exist", pattern.display());
-            return Err(Trouble::new(cause).remedy("correct its name, or remove the line"));
+            self.lacks(place, &pattern)?;
         }
+        // A link may lead nowhere.
+        let (found, gone): (Vec<PathBuf>, Vec<PathBuf>) =
+            found.into_iter().partition(|path| self.missing.is_none() || path.exists());
+        gone.iter().try_for_each(|path| self.lacks(place, path))?;
         let found: Vec<Arc<Path>> = found.into_iter().map(Into::into).collect();
         self.config.includes.push(Include { place: place.clone(), found: found.clone() });
         for path in found {
@@ -190,6 +213,17 @@ impl Reader<'_> {
                 self.config.files.push(SourceFile { path: path.clone(), text: text.clone() });
             }
             self.include(&path, &text)?;
+        }
+        Ok(())
+    }
+
+    /// An included file is not there.
+    fn lacks(&mut self, place: &Place, path: &Path) -> Result<(), Trouble> {
+        let cause = format!("Include file '{}' does not exist", path.display());
+        let trouble = Trouble::new(cause).remedy("correct its name, or remove the line");
+        match &mut self.missing {
+            Some(missing) => missing.push(trouble.of(place)),
+            None => return Err(trouble),
         }
         Ok(())
     }

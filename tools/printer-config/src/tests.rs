@@ -138,6 +138,16 @@ fn includes_find_files_as_pythons_glob_does() {
     assert!(config.section("hidden").is_none() && config.section("deep").is_some());
     assert_eq!(config.paths().count(), 4);
     std::os::unix::fs::symlink("nowhere", path("link.cfg")).unwrap();
+    let text = "[a]\nx: 1\n[include link.cfg]\n[include macros/1.cfg]\n[include no.cfg]\n[b]\n";
+    fs::write(path("printer.cfg"), text).unwrap();
+    let (config, missing) = Config::read_present(&path("printer.cfg")).unwrap();
+    assert_eq!((config.section("a").unwrap().text("x"), config.section("b").is_some()), (Some("9"), true));
+    let missing: Vec<String> = missing.iter().map(ToString::to_string).collect();
+    assert!(missing[0].contains("printer.cfg:3: ") && missing[1].contains("printer.cfg:5: "), "{missing:?}");
+    assert_eq!(missing.len(), 2);
+    let copied = write(&config, &[], &path("copy")).unwrap();
+    let copied = fs::read_to_string(copied).unwrap();
+    assert_eq!(copied, text.replace("[include link", "# [include link").replace("[include no", "# [include no"));
     for (name, line) in [("link.cfg", "link.cfg: Unable to open config file: "), ("no.cfg", "no.cfg' does not exist: ")]
     {
         fs::write(path("printer.cfg"), format!("[a]\n[include {name}]\n")).unwrap();

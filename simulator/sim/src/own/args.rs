@@ -68,8 +68,8 @@ pub(crate) struct OwnArgs {
     /// The folder for klippy's copy and its logs; a new one in /tmp by default
     #[arg(long, value_name = "DIR", conflicts_with = "in_place_pty")]
     pub(crate) folder: Option<PathBuf>,
-    /// Leave the sections out of klippy's copy for which it has no module, for example of shaketune. Without --klipper:
-    /// which neither Klipper nor Kalico has
+    /// Leave the sections out of klippy's copy for which it has no module, for example of shaketune, and the included
+    /// files that are not there. Without --klipper: the sections that neither Klipper nor Kalico has
     #[arg(long, conflicts_with = "in_place_pty")]
     pub(crate) without_plugins: bool,
     /// Make no copy: put each pty where `serial` of printer.cfg expects it

@@ -84,7 +84,10 @@ impl Own {
 }
 
 fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translated), Trouble> {
-    let mut config = Config::read(path)?;
+    let (mut config, missing) = match reading.without_plugins {
+        true => Config::read_present(path)?,
+        false => (Config::read(path)?, Vec::new()),
+    };
     config.put_constants_in();
     if reading.is_checked {
         check(&config)?;
@@ -93,7 +96,9 @@ fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translat
         true => LeftOut::of(&config, reading.klipper)?,
         false => LeftOut::default(),
     };
-    let translated = translate(&config, reading.pace, &left_out)?;
+    let mut translated = translate(&config, reading.pace, &left_out)?;
+    let gone = missing.into_iter().map(|trouble| trouble.remedy("klippy's copy is without it"));
+    translated.notes.splice(0..0, gone);
     Ok((config, left_out, translated))
 }
 
