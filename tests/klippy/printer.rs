@@ -93,6 +93,7 @@ impl Printer {
         let config = SimConfig::parse(&fs::read_to_string(path("board.toml")).unwrap(), "board.toml").unwrap();
         let clock = pinion_host::start();
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone())).unwrap();
+        let probe = probe.in_one_clock();
         probe.record_spi(File::create(path("spi")).unwrap());
         let links: Vec<PathBuf> = boards
             .iter()

@@ -265,6 +265,7 @@ fn run_in_one_clock(
         let clock = pinion_host::start();
         let camera = args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose()?;
         let SimWorld { boards, probe } = SimWorld::new(config, Arc::new(clock.clone()))?;
+        let probe = probe.in_one_clock();
         let forms = pinion_host::forms(&attempt.klipper);
         let shown = OwnStatus::default();
         camera.map_or(Ok(()), |camera| camera.start(probe.clone(), shown.clone()))?;

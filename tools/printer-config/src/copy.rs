@@ -97,10 +97,6 @@ fn changed(
         }
     }
     for include in config.includes.iter().filter(|include| include.place.file == *path) {
-        if include.found.is_empty() {
-            comment_out(&mut lines, include.place.line);
-            continue;
-        }
         let is_outside = |file: &Arc<Path>| places.get(file).is_some_and(|place| place.starts_with(OUTSIDE));
         let inside = places.get(path).is_some_and(|place| !place.starts_with(OUTSIDE));
         if inside && !include.found.iter().any(is_outside) {
@@ -120,7 +116,13 @@ fn changed(
         let is_first = opened.insert(name.clone());
         if change.left_out {
             comment_out(&mut lines, place.line);
-            if let (true, Some(text), Some(line)) = (is_first, &change.instead, lines.get_mut(place.line - 1)) {
+            // In front of the SAVE_CONFIG block, if the section is in it: each line there has a mark.
+            let is_saved = lines.get(place.line - 1).is_some_and(|line| line.starts_with("#*#"));
+            let at =
+                if is_saved { lines.iter().position(|line| line.starts_with("#*#")) } else { Some(place.line - 1) };
+            if let (true, Some(text), Some(line)) =
+                (is_first, &change.instead, at.and_then(|at| lines.get_mut(at - is_saved as usize)))
+            {
                 *line = format!("{text}\n{line}");
             }
             continue;

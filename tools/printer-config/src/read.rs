@@ -38,23 +38,20 @@ impl Config {
         Config::read_with(files, path, None).map(|(config, _)| config)
     }
 
-    /// Reads a printer.cfg with the included files that are there. It adds a trouble for each one that is not: a copy of a
-    /// configuration may lack those of other programs.
+    /// Reads a printer.cfg of which an included file may be missing: a copy may lack the files of other programs. In the
+    /// place of such a file comes the text that `stand_in` gives for its path. Returns a trouble for each, too.
     ///
     /// # Errors
     ///
     /// All others of [`Config::read`].
-    pub fn read_present(path: &Path) -> Result<(Config, Vec<Trouble>), Trouble> {
-        Config::read_with(&Disk, path, Some(Vec::new())).map(|(config, missing)| (config, missing.unwrap_or_default()))
+    pub fn read_present(path: &Path, stand_in: StandIn) -> Result<(Config, Vec<Trouble>), Trouble> {
+        Config::read_with(&Disk, path, Some(stand_in))
     }
 
-    fn read_with(
-        files: &dyn Files,
-        path: &Path,
-        missing: Option<Vec<Trouble>>,
-    ) -> Result<(Config, Option<Vec<Trouble>>), Trouble> {
-        let (config, within) = (Config::default(), Vec::new());
-        let mut reader = Reader { files, config, within, missing, opened: 0, bytes: 0, names_left: NAMES_MAX };
+    fn read_with(files: &dyn Files, path: &Path, stand_in: Option<StandIn>) -> Result<(Config, Vec<Trouble>), Trouble> {
+        let (config, within, missing) = (Config::default(), Vec::new(), Vec::new());
+        let mut reader =
+            Reader { files, config, within, stand_in, missing, opened: 0, bytes: 0, names_left: NAMES_MAX };
         let text = reader.text(path)?;
         let (usual, saved) = match text.find(SAVED).map(|at| text.split_at(at)) {
             Some((usual, block)) => match saved_lines(&block[SAVED.len()..]) {
@@ -132,13 +129,17 @@ fn remedy(error: &io::Error) -> &'static str {
     }
 }
 
+/// The text in the place of a missing file.
+pub type StandIn = fn(&Path) -> &'static str;
+
 struct Reader<'a> {
     files: &'a dyn Files,
     config: Config,
     /// The files that are being read: each includes the next one.
     within: Vec<PathBuf>,
-    /// The included files that are not there; `None` if the first one ends the reading.
-    missing: Option<Vec<Trouble>>,
+    /// The text in the place of a missing file; `None` if the first one ends the reading.
+    stand_in: Option<StandIn>,
+    missing: Vec<Trouble>,
     opened: usize,
     bytes: usize,
     /// How many more names the patterns may look at.
@@ -198,17 +199,22 @@ impl Reader<'_> {
         let found = matching(self.files, &pattern, &mut self.names_left).map_err(|error| {
             Trouble::new(format!("Include file '{}': {error}", pattern.display())).remedy("name fewer files")
         })?;
-        if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) {
-            self.lacks(place, &pattern)?;
-        }
-        // A link may lead nowhere.
-        let (found, gone): (Vec<PathBuf>, Vec<PathBuf>) =
-            found.into_iter().partition(|path| self.missing.is_none() || path.exists());
-        gone.iter().try_for_each(|path| self.lacks(place, path))?;
+        let found = match self.stand_in {
+            Some(_) if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) => vec![pattern],
+            None if found.is_empty() && !is_pattern(&pattern.to_string_lossy()) => return Err(missing(&pattern)),
+            _ => found,
+        };
         let found: Vec<Arc<Path>> = found.into_iter().map(Into::into).collect();
         self.config.includes.push(Include { place: place.clone(), found: found.clone() });
         for path in found {
-            let text = self.text(&path)?;
+            let text = match self.stand_in {
+                // A link may lead nowhere.
+                Some(stand_in) if !path.exists() => {
+                    self.missing.push(missing(&path).of(place));
+                    stand_in(&path).to_owned()
+                }
+                _ => self.text(&path)?,
+            };
             if !self.config.files.iter().any(|file| file.path == path) {
                 self.config.files.push(SourceFile { path: path.clone(), text: text.clone() });
             }
@@ -216,15 +222,10 @@ impl Reader<'_> {
         }
         Ok(())
     }
+}
 
-    /// An included file is not there.
-    fn lacks(&mut self, place: &Place, path: &Path) -> Result<(), Trouble> {
-        let cause = format!("Include file '{}' does not exist", path.display());
-        let trouble = Trouble::new(cause).remedy("correct its name, or remove the line");
-        match &mut self.missing {
-            Some(missing) => missing.push(trouble.of(place)),
-            None => return Err(trouble),
-        }
-        Ok(())
-    }
+/// An included file is not there.
+fn missing(path: &Path) -> Trouble {
+    let cause = format!("Include file '{}' does not exist", path.display());
+    Trouble::new(cause).remedy("correct its name, or remove the line")
 }

@@ -140,14 +140,18 @@ fn includes_find_files_as_pythons_glob_does() {
     std::os::unix::fs::symlink("nowhere", path("link.cfg")).unwrap();
     let text = "[a]\nx: 1\n[include link.cfg]\n[include macros/1.cfg]\n[include no.cfg]\n[b]\n";
     fs::write(path("printer.cfg"), text).unwrap();
-    let (config, missing) = Config::read_present(&path("printer.cfg")).unwrap();
+    let (config, missing) =
+        Config::read_present(&path("printer.cfg"), |file| if file.ends_with("no.cfg") { "[of_no]\n" } else { "" })
+            .unwrap();
     assert_eq!((config.section("a").unwrap().text("x"), config.section("b").is_some()), (Some("9"), true));
     let missing: Vec<String> = missing.iter().map(ToString::to_string).collect();
     assert!(missing[0].contains("printer.cfg:3: ") && missing[1].contains("printer.cfg:5: "), "{missing:?}");
     assert_eq!(missing.len(), 2);
     let copied = write(&config, &[], &path("copy")).unwrap();
     let copied = fs::read_to_string(copied).unwrap();
-    assert_eq!(copied, text.replace("[include link", "# [include link").replace("[include no", "# [include no"));
+    assert_eq!((copied.as_str(), config.section("of_no").is_some()), (text, true));
+    assert_eq!(fs::read_to_string(path("copy/no.cfg")).unwrap(), "[of_no]\n");
+    assert_eq!(fs::read_to_string(path("copy/link.cfg")).unwrap(), "");
     for (name, line) in [("link.cfg", "link.cfg: Unable to open config file: "), ("no.cfg", "no.cfg' does not exist: ")]
     {
         fs::write(path("printer.cfg"), format!("[a]\n[include {name}]\n")).unwrap();
@@ -261,6 +265,16 @@ fn a_copy_without_a_section_has_none_of_its_lines() {
     let again = Config::read(&copied).unwrap();
     assert!(again.section("a").is_none());
     assert_eq!(again.section("b").unwrap().text("z_offset"), Some("1.5"), "the block counts");
+    // A section that only the block has.
+    fs::write(&path, format!("[c]\n\n{}", saved.replace("# # ", "# "))).unwrap();
+    let config = Config::read(&path).unwrap();
+    let another =
+        Change { instead: Some("[d]\nx: 1".into()), section: "a".into(), left_out: true, ..Change::default() };
+    let copied = write(&config, &[another], &folder.path().join("other")).unwrap();
+    let again = Config::read(&copied).unwrap();
+    assert_eq!(again.section("d").unwrap().text("x"), Some("1"));
+    assert_eq!(again.section("b").unwrap().text("z_offset"), Some("1.5"), "the block counts");
+    assert!(again.section("a").is_none());
 }
 
 /// Each of them finds nothing, and has to look at all names.

@@ -3,6 +3,7 @@
 
 pub(crate) mod assemble;
 pub(crate) mod bed;
+pub(crate) mod dock;
 pub(crate) mod follower;
 pub(crate) mod i2c;
 pub(crate) mod led;

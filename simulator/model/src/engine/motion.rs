@@ -7,9 +7,10 @@
 //! motors move one rail. On CoreXY each of two motors moves two of them. A rail keeps no place of its own: its place
 //! follows from its motors, so that motors of several boards may move it.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 
+use super::dock::Dock;
 use super::seqlock::Seqlock;
 use super::track::Track;
 use crate::description::axes::{AxisConfig, End};
@@ -152,6 +153,8 @@ pub struct Axis {
     /// The instant of the last step, the ticks between it and the step before, and the number of lost steps in a row
     /// until then.
     stride: Seqlock<3>,
+    /// The dock that the head may come to.
+    dock: OnceLock<Arc<Dock>>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -189,12 +192,18 @@ impl Axis {
             turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
             stride: Seqlock::new([0, u64::MAX, 0]),
+            dock: OnceLock::new(),
         }
     }
 
     /// The same motor, fixed to a rail that `first` moves.
     pub fn beside(self, first: &Axis) -> Axis {
         Axis { beside: Some((first.motor.clone(), first.step_mm())), ..self }
+    }
+
+    /// Has each of its steps look at a dock.
+    pub(crate) fn passes(&self, dock: Arc<Dock>) {
+        let _ = self.dock.set(dock);
     }
 
     pub fn set_both_edges(&self, both_edges: bool) {
@@ -250,6 +259,9 @@ impl Axis {
         let position = self.motor.steps().wrapping_add(way);
         self.motor.position.store(position, Ordering::Relaxed);
         self.motor.track.push(at, position);
+        if let Some(dock) = self.dock.get() {
+            dock.passed();
+        }
         true
     }
 

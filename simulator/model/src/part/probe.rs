@@ -2,6 +2,8 @@
 //! A switch beside the nozzle that closes when it touches the bed: an inductive probe, a Klicky, a microswitch. It has
 //! no noise and no hysteresis.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Workshop};
@@ -9,6 +11,7 @@ use crate::description::check::{Trouble, check_offsets};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
+use crate::engine::dock::Dock;
 use crate::engine::wire::{Wire, input};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -27,6 +30,9 @@ pub struct ProbeConfig {
     pub y_offset_mm: f64,
     /// How far below the nozzle the probe touches the bed.
     pub z_offset_mm: f64,
+    /// Where the nozzle is when the head comes to the probe's dock, along the x and y axes. The probe is in the dock at
+    /// first. The head takes it up there, and leaves it there the next time. Without it the pin is high.
+    pub dock_mm: Option<[f64; 2]>,
 }
 
 impl Part for ProbeConfig {
@@ -44,7 +50,12 @@ impl Part for ProbeConfig {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let tip = [self.x_offset_mm, self.y_offset_mm, -self.z_offset_mm];
-        workshop.wire(Some(&self.pin), switch(workshop.bed(), tip));
+        let place = self.dock_mm.and_then(|mm| Some((workshop.rail("x")?, workshop.rail("y")?, mm)));
+        let dock = place.map(|(x, y, mm)| Arc::new(Dock::new(x, y, mm)));
+        if let Some(dock) = &dock {
+            workshop.head_passes(dock);
+        }
+        workshop.wire(Some(&self.pin), switch(workshop.bed(), tip, dock));
         Ok(())
     }
 
@@ -62,8 +73,9 @@ impl Part for ProbeConfig {
 }
 
 /// A switch at `tip`, which is the point of contact relative to the nozzle.
-fn switch(bed: Bed, tip: [f64; 3]) -> impl Wire {
-    input("probe".into(), move |_| bed.clearance_mm(tip) <= 0.0)
+fn switch(bed: Bed, tip: [f64; 3], dock: Option<Arc<Dock>>) -> impl Wire {
+    let is_docked = move || dock.as_ref().is_some_and(|dock| dock.has_probe());
+    input("probe".into(), move |_| is_docked() || bed.clearance_mm(tip) <= 0.0)
 }
 
 #[cfg(test)]
@@ -72,7 +84,6 @@ mod tests {
     use crate::description::default::DefaultPrinter;
     use crate::engine::motion::Axis;
     use pinion_firmware::time::Clock;
-    use std::sync::Arc;
 
     #[test]
     fn it_closes_at_the_step_that_takes_it_to_the_bed() {
@@ -82,7 +93,7 @@ mod tests {
             axis.set_enabled(true);
         }
         let bed = || Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z.clone()));
-        let probe = switch(bed(), [-30.0, 10.0, -2.5]);
+        let probe = switch(bed(), [-30.0, 10.0, -2.5], None);
         // The nozzle is at 60, 45 and 12 mm.
         let height = bed().height_mm(60.0 - 30.0, 45.0 + 10.0);
         let at_nozzle = bed().height_mm(60.0, 45.0);
@@ -97,5 +108,27 @@ mod tests {
         z.set_forward(true);
         z.edge(true, now);
         assert!(!probe.sense(false, now));
+    }
+
+    #[test]
+    fn the_head_takes_it_up_in_its_dock_and_leaves_it_there() {
+        let printer = DefaultPrinter::read();
+        let [x, y, z] = [0, 1, 2].map(|place| Arc::new(Axis::new(&printer.axes[place])));
+        let bed = Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z));
+        // The nozzle is at 60, 45 and 12 mm.
+        let dock = Arc::new(Dock::new(x.rail().clone(), y.rail().clone(), [70.0, 45.0]));
+        let probe = switch(bed, [0.0; 3], Some(dock.clone()));
+        let now = Clock::from_ticks(0);
+        x.set_enabled(true);
+        x.passes(dock);
+        let mut go_to = |mm: f64| {
+            x.set_forward(mm > x.position_mm());
+            while (x.position_mm() - mm).abs() > x.step_mm() {
+                x.edge(true, now);
+            }
+            probe.sense(false, now)
+        };
+        let places = [65.0, 70.0, 65.0, 60.0, 71.0, 69.0, 75.0, 60.0];
+        assert_eq!(places.map(&mut go_to), [true, false, false, false, true, true, true, false]);
     }
 }

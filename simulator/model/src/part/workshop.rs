@@ -8,6 +8,7 @@ use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::{Kinematics, Printer};
 use crate::engine::bed::{Bed, BedShape, Hanging, Head, Plane};
+use crate::engine::dock::Dock;
 use crate::engine::i2c::{I2cBus, I2cChip};
 use crate::engine::motion::{Axis, Rail};
 use crate::engine::noise::Noise;
@@ -154,6 +155,12 @@ impl Workshop<'_> {
             z.extend(names.filter_map(|name| self.rail(name)).map(|rail| (rail, [0.0; 2])));
         }
         Head::Cartesian { x: self.rail("x"), y: self.rail("y"), z: Plane::new(z) }
+    }
+
+    /// Has the head look at a dock where it passes.
+    pub(crate) fn head_passes(&self, dock: &Arc<Dock>) {
+        let motors = ["x", "y"].into_iter().flat_map(|rail| self.printer.motors(rail));
+        motors.filter_map(|motor| self.axis(&motor.name)).for_each(|axis| axis.passes(dock.clone()));
     }
 
     /// Wires a pin, if the part has it.

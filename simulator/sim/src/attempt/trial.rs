@@ -100,7 +100,10 @@ impl<'a> Trial<'a> {
 
     /// Runs G-code. The error is the outcome.
     pub(super) fn gcode(&mut self, script: &str, limit: Duration) -> Result<(), Outcome> {
-        match self.host.gcode(script, limit) {
+        let ran = self.host.gcode(script, limit);
+        // The first lines of a cause are shown.
+        let script = script.replace('\n', ", ");
+        match ran {
             // M400 ends without an error if klippy stops during it.
             Ok(()) => self.still_ready(),
             Err(Refused::Error(words)) => {

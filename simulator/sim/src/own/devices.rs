@@ -120,8 +120,14 @@ impl Translator<'_> {
             section.required("z_offset")?;
         }
         let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
-        let part = Entry::default().set("kind", "probe").set("pin", pin);
-        self.out.add("part", Translator::offsets(part, section)?);
+        let mut part = Translator::offsets(Entry::default().set("kind", "probe").set("pin", pin), section)?;
+        // The macros of Klicky, which take the probe up and put it down.
+        let klicky = self.config.section("gcode_macro _User_Variables");
+        let place = |axis: &str| klicky?.text(&format!("variable_docklocation_{axis}"))?.trim().parse::<f64>().ok();
+        if let (Some(x), Some(y)) = (place("x"), place("y")) {
+            part = part.set("dock_mm", vec![x, y]);
+        }
+        self.out.add("part", part);
         Ok(())
     }
 

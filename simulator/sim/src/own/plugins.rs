@@ -18,6 +18,9 @@ const STEPPERS: [&str; 10] = ["x", "y", "z", "a", "b", "c", "left", "right", "be
 const Z_OFFSET_MM: f64 = 1.0;
 /// The pin of a stand-in, on the main MCU.
 pub(super) const PIN: &str = "pinion_stand_in";
+/// The sections of the file that Mainsail and Fluidd bring along.
+const OF_INTERFACE: &str =
+    "[virtual_sdcard]\npath: ~/printer_data/gcodes\n[pause_resume]\n[display_status]\n[respond]\n";
 /// Longest source of klippy.
 const SOURCE_MAX: u64 = 4 << 20;
 
@@ -27,6 +30,8 @@ pub(super) struct LeftOut {
     /// The whole names of the sections.
     pub(super) sections: Vec<String>,
     pub(super) stand_in: Option<StandIn>,
+    /// Whether included files are not there.
+    pub(super) files: bool,
 }
 
 /// A plain probe in the place of a plugin's.
@@ -83,7 +88,15 @@ impl LeftOut {
                 // A plugin may have the sensor. A heater needs it, so it stays, and klippy says so.
                 || kind == "temperature_sensor" && has_plugin && !has_known_sensor(section)
         };
-        let sections = all.iter().filter(is_out).map(|section| section.name.clone()).collect();
+        let mut sections: Vec<String> = all.iter().filter(is_out).map(|section| section.name.clone()).collect();
+        loop {
+            let hangs = |section: &&Section| !sections.contains(&section.name) && hangs_on(config, section, &sections);
+            let more: Vec<String> = all.iter().filter(hangs).map(|section| section.name.clone()).collect();
+            if more.is_empty() {
+                break;
+            }
+            sections.extend(more);
+        }
         let saved = config.section("probe");
         let stand_in = |section: &Section| {
             let offset = |key: &str, usual: f64| {
@@ -94,8 +107,38 @@ impl LeftOut {
             let offsets_mm = [offset("x_offset", 0.0)?, offset("y_offset", 0.0)?, offset("z_offset", Z_OFFSET_MM)?];
             Ok::<StandIn, Trouble>(StandIn { section: section.name.clone(), offsets_mm })
         };
-        Ok(LeftOut { sections, stand_in: probe.map(stand_in).transpose()? })
+        Ok(LeftOut { sections, stand_in: probe.map(stand_in).transpose()?, files: false })
     }
+}
+
+/// Whether klippy cannot read a section without the ones that are left out: it measures with their chip, or has a pin of
+/// theirs. The printer itself stays.
+fn hangs_on(config: &Config, section: &Section, left_out: &[String]) -> bool {
+    let measures = || {
+        ["accel_chip", "accel_chip_x", "accel_chip_y"]
+            .iter()
+            .filter_map(|key| section.text(key))
+            .any(|chip| left_out.iter().any(|name| name == chip))
+    };
+    let is_gone = |chip: &str| {
+        let names =
+            |name: &String| name.split_once(' ').map_or(name == chip, |(kind, own)| kind == chip || own == chip);
+        config.section(&format!("mcu {chip}")).is_none() && left_out.iter().any(names)
+    };
+    let has_pin = || {
+        section.settings().iter().filter(|setting| setting.key.ends_with("pin")).any(|setting| {
+            let pin = setting.value.trim_start_matches(['^', '~', '!', ' ']);
+            pin.split_once(':').is_some_and(|(chip, _)| is_gone(chip.trim()))
+        })
+    };
+    let is_printers = section.kind().starts_with("stepper") || section.kind().starts_with("extruder");
+    measures() || !is_printers && section.kind() != "heater_bed" && has_pin()
+}
+
+/// What klippy needs of an included file that is not there.
+pub(super) fn stand_in(path: &Path) -> &'static str {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    if ["mainsail.cfg", "fluidd.cfg", "client.cfg"].contains(&name) { OF_INTERFACE } else { "" }
 }
 
 /// Whether this is no stepper, or one of klippy's kinematics. A plugin may have others: `[stepper_mmu_gear]`.
@@ -134,7 +177,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("printer.cfg");
         fs::write(&path, text).unwrap();
-        let LeftOut { sections, stand_in } = LeftOut::of(&Config::read(&path).unwrap(), klipper).unwrap();
+        let LeftOut { sections, stand_in, .. } = LeftOut::of(&Config::read(&path).unwrap(), klipper).unwrap();
         (sections, stand_in)
     }
 
@@ -168,6 +211,13 @@ mod tests {
             "temperature_sensor a",
         ];
         assert_eq!(left_out(text, None).0, expected);
+    }
+
+    #[test]
+    fn what_measures_with_a_plugin_or_has_its_pins_goes_too() {
+        let text = "[beacon]\nserial: x\n[adxl345]\ncs_pin: beacon:PA3\n[resonance_tester]\naccel_chip: adxl345\n\
+                    [adxl345 bed]\ncs_pin: bed:PA3\n[mcu bed]\nserial: y\n[stepper_x]\nendstop_pin: beacon:PA1\n";
+        assert_eq!(left_out(text, None).0, ["beacon", "adxl345", "resonance_tester"]);
     }
 
     #[test]

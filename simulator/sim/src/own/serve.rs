@@ -17,7 +17,7 @@ use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::is_host_path;
 use toml::{Table, Value};
 
-use super::plugins::{LeftOut, StandIn};
+use super::plugins::{LeftOut, StandIn, stand_in};
 use super::translate::{Pace, Pins, Translated, check, translate};
 use crate::boards::links_of;
 
@@ -81,23 +81,29 @@ impl Own {
         let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
         Ok(Own { config, sim, description, mcus, notes, left_out })
     }
+
+    /// Whether klippy's copy is without something of the user's.
+    pub(crate) fn is_partial(&self) -> bool {
+        self.left_out.files || !self.left_out.sections.is_empty()
+    }
 }
 
 fn read(path: &Path, reading: &Reading<'_>) -> Result<(Config, LeftOut, Translated), Trouble> {
     let (mut config, missing) = match reading.without_plugins {
-        true => Config::read_present(path)?,
+        true => Config::read_present(path, stand_in)?,
         false => (Config::read(path)?, Vec::new()),
     };
     config.put_constants_in();
     if reading.is_checked {
         check(&config)?;
     }
-    let left_out = match reading.without_plugins {
+    let mut left_out = match reading.without_plugins {
         true => LeftOut::of(&config, reading.klipper)?,
         false => LeftOut::default(),
     };
+    left_out.files = !missing.is_empty();
     let mut translated = translate(&config, reading.pace, &left_out)?;
-    let gone = missing.into_iter().map(|trouble| trouble.remedy("klippy's copy is without it"));
+    let gone = missing.into_iter().map(|trouble| trouble.remedy("klippy's copy is without its macros"));
     translated.notes.splice(0..0, gone);
     Ok((config, left_out, translated))
 }
@@ -241,7 +247,7 @@ impl Folder {
             ..Change::default()
         });
         changes.extend(phases);
-        let LeftOut { sections: left_out, stand_in } = own.left_out.clone();
+        let LeftOut { sections: left_out, stand_in, .. } = own.left_out.clone();
         changes.extend(left_out.iter().map(|section| Change {
             section: section.clone(),
             left_out: true,

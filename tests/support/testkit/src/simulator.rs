@@ -37,8 +37,9 @@ fn changed(file: &Path) -> Option<SystemTime> {
     fs::metadata(file).and_then(|about| about.modified()).ok()
 }
 
-/// The last changed file of a folder.
+/// The last changed file of a folder. No program is built from unit tests.
 fn newest(folder: &Path) -> Option<(SystemTime, PathBuf)> {
+    let is_of_program = |path: &PathBuf| path.file_stem().is_none_or(|name| name != "tests");
     let of = |path: PathBuf| if path.is_dir() { newest(&path) } else { changed(&path).map(|time| (time, path)) };
-    fs::read_dir(folder).ok()?.flatten().filter_map(|entry| of(entry.path())).max()
+    fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path()).filter(is_of_program).filter_map(of).max()
 }

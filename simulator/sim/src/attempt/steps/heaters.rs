@@ -83,10 +83,12 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     }
 }
 
-/// Heats the extruder for a print.
+/// Heats the extruder that prints. A macro may have chosen another one.
 pub(super) fn heat_extruder(trial: &mut Trial<'_>) -> Result<(), Outcome> {
+    let toolhead = trial.toolhead()?;
+    let active = toolhead["extruder"].as_str().unwrap_or("extruder");
     let mut targets = targets(trial);
-    targets.retain(|(name, _)| name == "extruder");
+    targets.retain(|(name, _)| name == active);
     heat(trial, &targets)
 }
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Homing, and the second carriage of a printer with two.
 
+use pinion_printer_config::Limit;
+
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;
 use crate::attempt::trial::{LONG, Trial, coordinates, travel};
@@ -75,10 +77,16 @@ pub(super) fn second_carriage(trial: &mut Trial<'_>) -> Seen {
         |trial: &mut Trial<'_>, script: &str| trial.gcode(script, LONG).map_err(|outcome| outcome.at(&section.place));
     let before = trial.lost();
     gcode(trial, "G28")?;
-    gcode(trial, "SET_DUAL_CARRIAGE CARRIAGE=1")?;
     let (low, high) = travel(&trial.toolhead()?);
     let axis = usize::from(section.text("axis") == Some("y"));
     let (middle, letter) = ((low[axis] + high[axis]) / 2.0, ["X", "Y"][axis]);
+    // The first one would be in its way.
+    let first = trial.config().section(&format!("stepper_{}", AXES[axis]));
+    let end = first.and_then(|first| first.number("position_endstop", Limit::Any).ok().flatten());
+    if let Some(end) = end.filter(|end| (low[axis]..=high[axis]).contains(end)) {
+        gcode(trial, &format!("G90\nG1 {letter}{end:.2} F6000"))?;
+    }
+    gcode(trial, "SET_DUAL_CARRIAGE CARRIAGE=1")?;
     gcode(trial, &format!("G90\nG1 {letter}{middle:.2} F6000\nM400"))?;
     let off = trial.probe.axis("dual_carriage").map(|axis| (axis.position_mm - middle).abs());
     if let Some(off) = off.filter(|off| *off > NEAR_MM) {

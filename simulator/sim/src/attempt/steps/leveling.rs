@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Leveling with a probe, and the calibration of the probe.
 
+use pinion_printer_config::Limit;
+
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, Trial, travel};
 
@@ -57,6 +59,12 @@ fn apart(trial: &Trial<'_>) -> Option<(f64, String)> {
     apart.max_by(|(a, _), (b, _)| a.total_cmp(b))
 }
 
+/// How far the probe reaches below the nozzle.
+fn z_offset_mm(trial: &Trial<'_>) -> f64 {
+    let probe = trial.config().section("probe");
+    probe.and_then(|probe| probe.number("z_offset", Limit::Any).ok().flatten()).unwrap_or(0.0)
+}
+
 pub(super) fn probed(trial: &mut Trial<'_>) -> Seen {
     if !trial.has("probe") {
         return skipped("there is no probe");
@@ -65,7 +73,9 @@ pub(super) fn probed(trial: &mut Trial<'_>) -> Seen {
     // G28 may end where the probe has triggered, or where it is beside the bed.
     let (low, high) = travel(&trial.toolhead()?);
     let [x, y] = [0, 1].map(|n: usize| (low[n] + high[n]) / 2.0);
-    let middle = format!("G90\nG1 Z10 F600\nG1 X{x:.2} Y{y:.2} F6000");
+    // A probe that is put below the nozzle by hand needs more room.
+    let z = 10.0 + z_offset_mm(trial).max(0.0);
+    let middle = format!("G90\nG1 Z{z:.2} F600\nG1 X{x:.2} Y{y:.2} F6000");
     for command in ["G28", &middle, "PROBE_CALIBRATE", "ABORT"] {
         trial.gcode(command, LONG)?;
     }
