@@ -17,12 +17,20 @@ const TILT_MM: [f64; 2] = [-0.3, 0.4];
 /// A motor without an end of its own.
 const FREE_MM: f64 = 1000.0;
 
+/// Room behind an endstop.
+const OVERTRAVEL_MM: f64 = 3.0;
+/// How long a motor runs on when an endstop at another MCU triggers: klippy's `TRSYNC_TIMEOUT` is 25 ms, and the block with
+/// the stop is under way, too.
+const STOP_S: f64 = 0.04;
+
 /// A rail's travel and its endstop.
 struct Rail {
     min: f64,
     max: f64,
     endstop: f64,
     at_max: bool,
+    /// How far it goes behind its endstop while it homes.
+    overtravel: f64,
 }
 
 impl Rail {
@@ -196,14 +204,16 @@ impl<'a> Translator<'a> {
                 return Err(section.trouble("position_endstop", cause).remedy("add homing_positive_dir"));
             }
         };
-        Ok(Rail { min, max, endstop, at_max })
+        let speed = section.number("homing_speed", Limit::Any)?.unwrap_or(5.0);
+        let overtravel = f64::max(OVERTRAVEL_MM, speed * STOP_S);
+        Ok(Rail { min, max, endstop, at_max, overtravel })
     }
 
     /// The keys of a rail's travel and endstop.
     fn with_rail(entry: Entry, rail: &Rail, endstop: &Endstop, start: f64) -> Entry {
         let end = if rail.at_max { "max" } else { "min" };
         let (mut min, mut max) = (rail.min, rail.max);
-        let mut overtravel = 3.0;
+        let mut overtravel = rail.overtravel;
         match endstop {
             Endstop::Switch(_) => {}
             // The stop is where klippy believes it to be.
@@ -211,7 +221,7 @@ impl<'a> Translator<'a> {
                 (max, overtravel) = (rail.endstop, 0.0);
             }
             Endstop::Sensorless => (min, overtravel) = (rail.endstop, 0.0),
-            Endstop::Other => overtravel = 5.0,
+            Endstop::Other => overtravel = overtravel.max(5.0),
         }
         let entry = entry.set("min_mm", min).set("travel_mm", max).set("overtravel_mm", overtravel);
         let entry = entry.set("start_mm", start.clamp(min, max));
@@ -236,7 +246,7 @@ impl<'a> Translator<'a> {
     fn axis_below(&mut self, name: &str, section: &Section, min: f64, highest: f64, start: f64) -> Result<(), Trouble> {
         let entry = self.motor(section, name)?;
         let endstop = self.endstop(section)?;
-        let rail = Rail { min, max: highest, endstop: highest, at_max: true };
+        let rail = Rail { min, max: highest, endstop: highest, at_max: true, overtravel: OVERTRAVEL_MM };
         self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, start));
         Ok(())
     }
@@ -492,7 +502,13 @@ impl<'a> Translator<'a> {
                 let entry = match (kind, section.text("endstop_pin")) {
                     ("manual_stepper", Some(_)) => {
                         let endstop = self.endstop(section)?;
-                        let rail = Rail { min: -FREE_MM, max: FREE_MM, endstop: 0.0, at_max: false };
+                        let rail = Rail {
+                            min: -FREE_MM,
+                            max: FREE_MM,
+                            endstop: 0.0,
+                            at_max: false,
+                            overtravel: OVERTRAVEL_MM,
+                        };
                         Translator::with_rail(entry, &rail, &endstop, BEFORE_ENDSTOP_MM)
                     }
                     _ => entry,

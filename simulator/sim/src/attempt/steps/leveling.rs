@@ -41,7 +41,9 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
         for script in ["G28", command, "M400"] {
             trial.gcode(script, LONG).map_err(|outcome| outcome.at(place))?;
         }
-        if let Some((apart, name)) = apart(trial).filter(|(apart, _)| *apart > LEVEL_MM && *moves == Moves::Motors) {
+        if let Some((apart, name)) =
+            apart(trial).filter(|(apart, _)| *apart > level_mm(trial) && *moves == Moves::Motors)
+        {
             let cause = format!("after {command} the motor {name} holds its side {apart:.3} mm too high or low");
             return Err(trial.failed(cause, Some(place.clone())));
         }
@@ -49,6 +51,14 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
     trial.lost_none_since(&before)?;
     let commands: Vec<&str> = found.iter().map(|(_, command, _)| *command).collect();
     Ok(commands.join(", "))
+}
+
+/// The same with the tolerance of the user. The motors are farther apart than the points.
+fn level_mm(trial: &Trial<'_>) -> f64 {
+    let sections = ["z_tilt", "z_tilt_ng", "quad_gantry_level"].map(|name| trial.config().section(name));
+    let tolerances = sections.into_iter().flatten();
+    let tolerances = tolerances.filter_map(|section| section.number("retry_tolerance", Limit::Any).ok().flatten());
+    tolerances.map(|tolerance| 2.0 * tolerance).fold(LEVEL_MM, f64::max)
 }
 
 /// The largest distance of a z motor from the first one, and its name. The simulated bed is flat.

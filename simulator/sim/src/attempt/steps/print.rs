@@ -106,7 +106,15 @@ fn prepare(trial: &mut Trial<'_>) -> Result<(), Outcome> {
     if trial.attempt.gcode.is_some() {
         return Ok(());
     }
+    // The macros have begun and ended a print, or stopped somewhere in it.
+    trial.gcode("SET_GCODE_OFFSET X=0 Y=0 Z=0\nM220 S100\nM221 S100", LONG)?;
+    if trial.has("skew_correction") {
+        trial.gcode("SET_SKEW CLEAR=1", LONG)?;
+    }
     trial.gcode("G28", LONG)?;
+    if trial.has("dual_carriage") {
+        trial.gcode("SET_DUAL_CARRIAGE CARRIAGE=0\nACTIVATE_EXTRUDER EXTRUDER=extruder", LONG)?;
+    }
     heat_extruder(trial)
 }
 
