@@ -15,6 +15,8 @@ use crate::turns;
 pub(crate) const LOOK_MS: i32 = 5;
 /// A child that is still there after this real time holds the clock no longer. A plugin's child may run for ever.
 const HOLD: Duration = Duration::from_secs(60);
+/// A new child that sleeps in so many looks in a row waits for something, for example for what klippy will write.
+const RESTS: u32 = 3;
 
 /// Highest number of children that are known at a time. Each has a word that klippy shares with it.
 const WORDS: usize = 256;
@@ -50,13 +52,20 @@ static CHILDREN: Mutex<Vec<Child>> = Mutex::new(Vec::new());
 /// Whether a child computes, so that no time passes.
 pub(crate) fn hold_the_clock() -> bool {
     let mut children = CHILDREN.lock().unwrap_or_else(PoisonError::into_inner);
-    let looks_max = (HOLD.as_millis() / LOOK_MS as u128) as u32;
     children.retain_mut(|child| {
         child.looks += 1;
-        child.looks < looks_max && lives(child.pid)
+        child.looks < looks_max() && lives(child.pid)
     });
-    let waits = |child: &Child| WAITS.get().is_some_and(|words| words[child.word].load(Ordering::SeqCst) != 0);
     children.iter().any(|child| !waits(child))
+}
+
+fn looks_max() -> u32 {
+    (HOLD.as_millis() / LOOK_MS as u128) as u32
+}
+
+/// Whether a child waits for klippy to read.
+fn waits(child: &Child) -> bool {
+    WAITS.get().is_some_and(|words| words[child.word].load(Ordering::SeqCst) != 0)
 }
 
 /// A child that has ended counts as such, before klippy has waited for it.
@@ -94,10 +103,32 @@ fn forked(pid: libc::pid_t, word: usize, is_main: bool) {
             }
         }
         pid if pid > 0 => {
-            CHILDREN.lock().unwrap_or_else(PoisonError::into_inner).push(Child { pid, looks: 0, word });
+            let child = Child { pid, looks: 0, word };
+            await_rest(&child);
+            CHILDREN.lock().unwrap_or_else(PoisonError::into_inner).push(child);
         }
         _ => {}
     }
+}
+
+/// Waits until a new child has ended, or waits for something. klippy may look at once whether it is done: the answer is the
+/// same however fast this computer is.
+fn await_rest(child: &Child) {
+    let mut rests = 0;
+    for _ in 0..looks_max() {
+        rests = if is_asleep(child.pid) { rests + 1 } else { 0 };
+        if rests == RESTS || waits(child) || !lives(child.pid) {
+            return;
+        }
+        let (none, count, ms) = (std::ptr::null_mut(), 0, LOOK_MS);
+        real!(fn poll(none: *mut libc::pollfd, count: libc::nfds_t, ms: i32) -> i32);
+    }
+}
+
+/// Whether a process sleeps in the kernel (proc_pid_stat(5), the third field).
+fn is_asleep(pid: libc::pid_t) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    stat.rsplit_once(") ").is_some_and(|(_, rest)| rest.starts_with('S'))
 }
 
 /// # Safety
