@@ -305,7 +305,7 @@ ifeq ($(DESTDIR),)
 endif
 
 ARCH ?=
-# Rust is rustup's, of which dpkg knows nothing: -d leaves the build dependencies to us.
+# Rust is rustup's, and dpkg does not know it: -d leaves the build dependencies to us.
 deb: system-packages-deb
 	@scripts/build-deb '$(DEB_FOLDER)' $(ARCH)
 

@@ -88,7 +88,7 @@ impl Queue {
     fn take(&mut self, record: &Record<'_>, style: Style, now: Duration) {
         self.report(style, now);
         if record.level() > Level::Info {
-            // Whoever asks for details gets all of them.
+            // A user who asks for details gets all of them.
             return self.push(style.line(record.level(), *record.args()));
         }
         let (target, place) = (record.target(), record.line());

@@ -41,7 +41,7 @@ fn every_block_says_what_it_is() {
             assert!(KINDS.contains(&block.kind.as_str()), "{name}:{line}: a block of {:?}", block.kind);
             assert!(!block.text.trim().is_empty(), "{name}:{line}: an empty block");
             let names_a_file = block.before.contains(".cfg`") || block.before.contains(".conf`");
-            assert!(block.kind != "ini" || names_a_file, "{name}:{line}: it does not say of which file it is");
+            assert!(block.kind != "ini" || names_a_file, "{name}:{line}: it does not name its file");
             let reason = block.not_tried.as_deref();
             assert!(reason.is_none() || block.kind == COMMANDS, "{name}:{line}: nobody would try this anyway");
             assert_ne!(reason, Some(""), "{name}:{line}: it does not say why it is not tried");

@@ -235,7 +235,7 @@ pub fn program() -> Command {
     program
 }
 
-/// The path of `pinion`, with `pinion-sim` beside it. Whoever asks for it will start it.
+/// The path of `pinion`, with `pinion-sim` beside it. The caller will start it.
 pub fn pinion_path() -> &'static Path {
     run_first();
     let pinion = Path::new(env!("CARGO_BIN_EXE_pinion"));
@@ -295,7 +295,7 @@ pub fn printed(args: &[&str]) -> String {
 
 /// Runs `pinion` to its end.
 pub fn output(args: &[&str]) -> std::process::Output {
-    // A klippy of whoever runs the tests would judge each printer.cfg.
+    // A klippy of the user who runs the tests would judge each printer.cfg.
     Command::new(pinion_path()).args(args).env_remove("KLIPPER_DIR").output().unwrap()
 }
 

@@ -121,7 +121,7 @@ fn each_line_that_the_program_logs_is_on_the_page() {
             }
             assert!(
                 quotations.iter().any(|quotation| has(&line, quotation)),
-                "{file} logs \"{line}\", of which the page has nothing"
+                "{file} logs \"{line}\", which is not on the page"
             );
         }
     }

@@ -144,7 +144,7 @@ impl SimProbe {
         self.bed.space()
     }
 
-    /// Its boards run in one clock: the steps of several come in the order of their time, but for a few ticks by which
+    /// Its boards run in one clock: the steps of several come in the order of their time, except for a few ticks by which
     /// their clocks drift. A recorder that waited longer would lose steps of a motor with 256 microsteps.
     pub fn in_one_clock(mut self) -> SimProbe {
         self.settles = self.settles.min(Ticks::from_ms(1));

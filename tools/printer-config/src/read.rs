@@ -38,7 +38,7 @@ impl Config {
         Config::read_with(files, path, None).map(|(config, _)| config)
     }
 
-    /// Reads a printer.cfg of which an included file may be missing: a copy may lack the files of other programs. In the
+    /// Reads a printer.cfg whose included files may be missing: a copy may lack the files of other programs. In the
     /// place of such a file comes the text that `stand_in` gives for its path. Returns a trouble for each, too.
     ///
     /// # Errors

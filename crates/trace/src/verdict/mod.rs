@@ -2,7 +2,7 @@
 //! The verdict over a trace: who was late, by how much, and what to do about it.
 //!
 //! A stop that is about a time has a span in which it went wrong. It begins when the work was due, or when the host's
-//! block came, and ends with the stop. Whoever took at least half of this span is the culprit. Without evidence against
+//! block came, and ends with the stop. The one who took at least half of this span is the culprit. Without evidence against
 //! anybody the verdict says what is known, and accuses nobody.
 
 use pinion_firmware::shutdown::reason;
