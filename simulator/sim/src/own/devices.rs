@@ -122,8 +122,11 @@ impl Translator<'_> {
         let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
         let mut part = Translator::offsets(Entry::default().set("kind", "probe").set("pin", pin), section)?;
         // The macros of Klicky, which take the probe up and put it down.
-        let klicky = self.config.section("gcode_macro _User_Variables");
-        let place = |axis: &str| klicky?.text(&format!("variable_docklocation_{axis}"))?.trim().parse::<f64>().ok();
+        let macros = || self.config.of_kind("gcode_macro");
+        let place = |axis: &str| {
+            let key = format!("variable_docklocation_{axis}");
+            macros().find_map(|section| section.text(&key)?.trim().parse::<f64>().ok())
+        };
         if let (Some(x), Some(y)) = (place("x"), place("y")) {
             part = part.set("dock_mm", vec![x, y]);
         }

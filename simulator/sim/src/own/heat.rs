@@ -82,11 +82,13 @@ impl Translator<'_> {
             Some(pin) => {
                 let rate = self.kelvin_per_second(section)?;
                 let watts = rate * J_PER_K;
+                // A heater that never gets all of its power has more of it.
+                let share = section.number("max_power", Limit::Above(0.0))?.unwrap_or(1.0).min(1.0);
                 let real_max = max.min(REAL_MAX_CELSIUS[usize::from(section.kind() != "heater_bed")]);
                 let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, real_max)?);
                 entry
                     .set("pin", pin.as_str())
-                    .set("heater_watts", watts)
+                    .set("heater_watts", watts / share)
                     .set("heat_capacity_j_per_k", J_PER_K)
                     .set("loss_w_per_k", watts / reach)
             }

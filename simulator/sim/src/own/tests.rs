@@ -291,3 +291,21 @@ fn a_probe_as_endstop_leaves_position_endstop_without_a_meaning() {
     assert_ne!(text, PRINTER);
     translated(&text).unwrap();
 }
+
+#[test]
+fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
+    let klicky =
+        "[gcode_macro _User_Variables]\nvariable_docklocation_x: -21\nvariable_docklocation_y: 370.5 \ngcode:\n";
+    let text = |more: &str| PRINTER.replace("[probe]", &format!("{klicky}[probe]")).replace("[extruder]", more);
+    let of = |text: &str, kind: &str, key: &str, value: &str| -> Table {
+        let description = translated(text).unwrap().description;
+        let all = description[kind].as_array().unwrap().iter().filter_map(Value::as_table);
+        all.cloned().find(|table| table.get(key).and_then(Value::as_str) == Some(value)).unwrap()
+    };
+    let probe = of(&text("[extruder]"), "part", "kind", "probe");
+    assert_eq!(probe["dock_mm"].as_array().unwrap(), &[Value::from(-21.0), Value::from(370.5)]);
+    let watts = |more: &str| of(&text(more), "heater", "name", "extruder")["heater_watts"].as_float().unwrap();
+    assert!((watts("[extruder]\nmax_power: 0.4") * 0.4 - watts("[extruder]")).abs() < 1e-9);
+    let room = |text: &str| of(text, "axis", "name", "x")["overtravel_mm"].as_float().unwrap();
+    assert_eq!(room(&PRINTER.replace("[stepper_x]", "[stepper_x]\nhoming_speed: 150")), 6.0);
+}

@@ -74,7 +74,7 @@ fn parameters(trial: &Trial<'_>, name: &str) -> String {
 fn celsius(name: &str) -> Option<u32> {
     let has = |words: &[&str]| words.iter().any(|word| name.contains(word));
     match name {
-        _ if has(&["CHAMBER", "SOAK", "TIME"]) => None,
+        _ if has(&["CHAMBER", "SOAK", "TIME", "MESH", "PROFILE", "DIAMETER", "SIZE"]) => None,
         _ if has(&["BED"]) => Some(60),
         _ if has(&["EXTR", "HOTEND", "NOZZLE", "TEMP", "TOOL_T"]) => Some(200),
         _ => None,
@@ -87,7 +87,8 @@ mod tests {
 
     #[test]
     fn a_parameter_s_name_says_its_temperature() {
-        let names = ["T_BED", "BEDTEMP", "T_EXTRUDER", "EXTRUDER_TEMP", "NOZZLE", "CHAMBER_TEMP", "MATERIAL", "SIZE"];
+        let names =
+            ["T_BED", "BEDTEMP", "T_EXTRUDER", "EXTRUDER_TEMP", "NOZZLE", "CHAMBER_TEMP", "BED_MESH", "MATERIAL"];
         let celsius = names.map(celsius);
         assert_eq!(celsius, [Some(60), Some(60), Some(200), Some(200), Some(200), None, None, None]);
     }
