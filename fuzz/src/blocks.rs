@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Blocks, messages and integers of the wire.
 
-use pinion_protocol::block::{BLOCK_MAX, BLOCK_MIN, Found, PAYLOAD_MAX, Received, Receiver, Resync, frame};
+use pinion_protocol::block::{BLOCK_MAX, BLOCK_MIN, PAYLOAD_MAX, Received, Receiver, Resync, Resynced, frame};
 use pinion_protocol::format;
 use pinion_protocol::vlq::{Reader, Writer};
 
@@ -28,9 +28,9 @@ fn blocks(stream: &[u8], piece: usize) -> Vec<Vec<u8>> {
         loop {
             let (taken, what) = resync.next(&buffer);
             match what {
-                Found::Nothing => break assert_eq!(taken, 0),
-                Found::Garbage { .. } => assert!(taken > 0),
-                Found::Block(sequence, payload) => {
+                Resynced::Nothing => break assert_eq!(taken, 0),
+                Resynced::Garbage { .. } => assert!(taken > 0),
+                Resynced::Block(sequence, payload) => {
                     let mut framed = Vec::new();
                     frame(payload, sequence, &mut framed);
                     assert_eq!(framed, buffer[..taken]);

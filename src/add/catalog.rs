@@ -50,13 +50,13 @@ pub(super) struct Device {
     /// The command to type when it works.
     pub(super) next: Vec<String>,
     /// The ways to connect it, the best one first.
-    pub(super) way: Vec<Way>,
+    pub(super) way: Vec<Wiring>,
 }
 
 /// A way to connect a device.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Way {
+pub(super) struct Wiring {
     pub(super) bus: Kind,
     /// SPI mode.
     #[serde(default)]
@@ -191,7 +191,7 @@ impl Device {
     }
 }
 
-impl Way {
+impl Wiring {
     /// Whether it can be made on this board.
     pub(super) fn fits(&self, board: &Board) -> bool {
         let roles = self.wires.iter().filter(|(_, role)| is_line(role)).count();
@@ -251,7 +251,7 @@ impl Catalog {
 
     /// The device that has this id in this register.
     pub(super) fn with_id(&self, register: u8, id: u8) -> Option<&Device> {
-        let has = |way: &Way| matches!(&way.check, Some(Check::Id { register: own, ids }) if *own == register && ids.contains(&id));
+        let has = |way: &Wiring| matches!(&way.check, Some(Check::Id { register: own, ids }) if *own == register && ids.contains(&id));
         self.devices.iter().find(|device| device.way.iter().any(has))
     }
 }
@@ -263,7 +263,7 @@ mod tests {
     use crate::boards;
     use crate::tree::Tree;
     use pinion_linux::gpio::Chip;
-    use pinion_system::board::{self, Spot};
+    use pinion_system::board::{self, Slot};
     use pinion_system::uses::Uses;
     use std::collections::{BTreeMap, BTreeSet};
     use std::fs;
@@ -478,7 +478,7 @@ mod tests {
         assert!(spot("tmc2209", w1).unwrap_err().starts_with("GPIO4 (pin 7) is used by [temperature_sensor x]"));
         assert!(spot("ds18b20", "[tmc2209 a]\nuart_pin: host:ttyAMA3\n").is_err());
         assert_eq!(spot("ds18b20", w1).unwrap(), "w1_bus_master1", "several thermometers share a wire");
-        assert_eq!(spot("relay", &spi(0)).unwrap(), Spot::default().node);
+        assert_eq!(spot("relay", &spi(0)).unwrap(), Slot::default().node);
         for (pin, place) in [
             ("gpio17", Ok("spidev0.0")),
             ("gpio8", Ok("spidev0.1")),
@@ -526,7 +526,7 @@ mod tests {
             tree.put("home/pi/printer_data/config/printer.cfg", config);
             let uses = Uses::find(&tree.computer(), Some(board), None, None);
             let search = Search { board, uses: &uses, own: None, there: None };
-            let wires = search.wires(relay, &relay.way[0], &Spot::default(), &BTreeMap::new(), wanted);
+            let wires = search.wires(relay, &relay.way[0], &Slot::default(), &BTreeMap::new(), wanted);
             wires.map(|wires| wires.last().unwrap().pin)
         };
         assert_eq!(line(&[], None), Ok(11));

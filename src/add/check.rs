@@ -8,7 +8,7 @@ use pinion_printer_config::Section;
 use serde_json::json;
 
 use crate::quietly;
-use pinion_system::board::{Board, Kind, Spot};
+use pinion_system::board::{Board, Kind, Slot};
 use pinion_system::{Access, Computer};
 
 use super::catalog::Check;
@@ -115,7 +115,7 @@ fn judge(file: &str, values: &[u32], highest: u32) -> Result<String, String> {
 }
 
 /// The pins of the bus that are GPIO lines now: another program has switched them. A Raspberry Pi shows this to root.
-fn strays(computer: &Computer, board: &Board, spot: &Spot) -> Vec<String> {
+fn strays(computer: &Computer, board: &Board, spot: &Slot) -> Vec<String> {
     let controllers = computer.matching("/sys/kernel/debug/pinctrl/*-pinctrl-*/pins");
     let is_header = |path: &&PathBuf| {
         let name = path.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();

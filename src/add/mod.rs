@@ -18,7 +18,7 @@ use pinion_linux::Inventory;
 use pinion_linux::foreign::word;
 use pinion_runtime::klippy::process::Process;
 use pinion_system::Computer;
-use pinion_system::board::{self, Board, Kind, Spot};
+use pinion_system::board::{self, Board, Kind, Slot};
 use pinion_system::complete::offering;
 use pinion_system::uses::{Resource, Source, Uses};
 
@@ -39,7 +39,7 @@ mod side;
 mod undo;
 mod work;
 
-use catalog::{Catalog, Device, Way};
+use catalog::{Catalog, Device, Wiring};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};
 use place::Search;
@@ -205,20 +205,20 @@ fn existing(target: &Target, device: &Device, args: &AddArgs) -> Result<Option<S
 }
 
 /// The ways to connect a device to this board, the best one first: all of them, or the one that is named.
-fn ways<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result<Vec<&'a Way>, String> {
+fn ways<'a>(board: &Board, device: &'a Device, wanted: Option<&str>) -> Result<Vec<&'a Wiring>, String> {
     let wanted = wanted.map(str::to_ascii_lowercase);
-    let is_wanted = |way: &&Way| match wanted.as_deref() {
+    let is_wanted = |way: &&Wiring| match wanted.as_deref() {
         None => true,
         Some("spi") => way.bus == Kind::Spi,
         Some("i2c") => way.bus == Kind::I2c,
         Some(_) => false,
     };
     let kinds: Vec<&str> = device.way.iter().map(|way| way.bus.name()).collect();
-    let ways: Vec<&Way> = device.way.iter().filter(is_wanted).collect();
+    let ways: Vec<&Wiring> = device.way.iter().filter(is_wanted).collect();
     if ways.is_empty() {
         return Err(format!("--bus: {} is connected by {}", device.name, kinds.join(" or ")));
     }
-    let ways: Vec<&Way> = ways.into_iter().filter(|way| way.fits(board)).collect();
+    let ways: Vec<&Wiring> = ways.into_iter().filter(|way| way.fits(board)).collect();
     match ways.is_empty() {
         false => Ok(ways),
         true => Err(format!(
@@ -237,15 +237,15 @@ const PINS: &str = "/usr/share/doc/pinion-mcu/guide/pins.md";
 fn place<'a>(
     search: &Search,
     device: &Device,
-    ways: &[&'a Way],
+    ways: &[&'a Wiring],
     args: &AddArgs,
     report: &mut Report,
-) -> Result<(&'a Way, Spot), String> {
-    let all = |ways: &[&'a Way]| -> Vec<(&'a Way, Spot)> {
+) -> Result<(&'a Wiring, Slot), String> {
+    let all = |ways: &[&'a Wiring]| -> Vec<(&'a Wiring, Slot)> {
         ways.iter().flat_map(|way| search.spots(way).into_iter().map(|spot| (*way, spot))).collect()
     };
     let section = search.there.as_ref().map(|name| format!("[{name}]"));
-    let is_placed = |(way, spot): &(&Way, Spot)| {
+    let is_placed = |(way, spot): &(&Wiring, Slot)| {
         let mut own = search.uses.all.iter().filter(|one| match &section {
             Some(section) => one.user == *section && matches!(one.source, Source::Printer(_)),
             None => search.own.is_some_and(|own| Target::is_use_of(one, own)),

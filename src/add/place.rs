@@ -4,10 +4,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use pinion_system::board::{Board, Kind, Spot, function};
+use pinion_system::board::{Board, Kind, Slot, function};
 use pinion_system::uses::{Resource, Source, Use, Uses, spi_node};
 
-use super::catalog::{Device, Way, is_line};
+use super::catalog::{Device, Wiring, is_line};
 use super::printer::Target;
 
 /// A wire to make.
@@ -15,7 +15,7 @@ use super::printer::Target;
 pub(crate) struct Wire {
     /// The device's pin.
     pub(crate) chip: String,
-    /// Its role, as in [`Way::wires`].
+    /// Its role, as in [`Wiring::wires`].
     pub(crate) role: String,
     /// The pin of the board's header, from 1 on.
     pub(crate) pin: usize,
@@ -32,7 +32,7 @@ pub(super) struct Search<'a> {
 }
 
 /// The lines of config.txt that a way needs at this place.
-pub(super) fn config_lines(way: &Way, spot: &Spot) -> Vec<String> {
+pub(super) fn config_lines(way: &Wiring, spot: &Slot) -> Vec<String> {
     let select = spot
         .node
         .strip_prefix("spidev")
@@ -42,12 +42,12 @@ pub(super) fn config_lines(way: &Way, spot: &Spot) -> Vec<String> {
 
 impl Search<'_> {
     /// The user of a part other than the device itself.
-    fn other<'a>(&'a self, what: &'a Resource, spot: &'a Spot, way: &'a Way) -> Option<&'a Use> {
+    fn other<'a>(&'a self, what: &'a Resource, spot: &'a Slot, way: &'a Wiring) -> Option<&'a Use> {
         self.uses.of(what).find(|one| !self.is_own(one, spot, way))
     }
 
     /// Whether a use is the device's: its file, or the overlay that it needs.
-    fn is_own(&self, one: &Use, spot: &Spot, way: &Way) -> bool {
+    fn is_own(&self, one: &Use, spot: &Slot, way: &Wiring) -> bool {
         let is_overlay = || {
             let mut loaded = self.uses.config_txt.loaded.iter().filter(|loaded| loaded.place == one.place);
             loaded.any(|loaded| {
@@ -62,9 +62,9 @@ impl Search<'_> {
 
     /// The places for a device that is connected in this way, the best one first. PWM and 1-Wire are where the boot loader
     /// has them.
-    pub(super) fn spots(&self, way: &Way) -> Vec<Spot> {
-        let Some(bus) = self.board.bus.get(&way.bus) else { return vec![Spot::default()] };
-        let spot = |mut spot: Spot| {
+    pub(super) fn spots(&self, way: &Wiring) -> Vec<Slot> {
+        let Some(bus) = self.board.bus.get(&way.bus) else { return vec![Slot::default()] };
+        let spot = |mut spot: Slot| {
             spot.pins = self.uses.pins(self.board, &spot);
             let channel = spot.pins.get("pwm").and_then(|pin| self.board.pwm.get(&pin.to_string()));
             if let (Some(channel), Some((chip, _))) = (channel, spot.node.split_once('/')) {
@@ -76,7 +76,7 @@ impl Search<'_> {
     }
 
     /// Why a device cannot be at this place.
-    pub(super) fn conflict(&self, way: &Way, spot: &Spot) -> Option<String> {
+    pub(super) fn conflict(&self, way: &Wiring, spot: &Slot) -> Option<String> {
         let told = |one: &Use, what: String| format!("{what} is used by {} ({})", one.user, one.place);
         let mut nodes = Vec::new();
         if let Some((bus, select)) = spi_node(&spot.node) {
@@ -121,14 +121,14 @@ impl Search<'_> {
     }
 
     /// The addresses that no other chip has on this bus.
-    pub(super) fn addresses(&self, way: &Way, spot: &Spot) -> Vec<u8> {
+    pub(super) fn addresses(&self, way: &Wiring, spot: &Slot) -> Vec<u8> {
         let bus = spot.node.strip_prefix("i2c-").and_then(|number| number.parse().ok()).unwrap_or_default();
         let is_free = |address: &&u8| self.other(&Resource::I2c(bus, Some(u16::from(**address))), spot, way).is_none();
         way.addresses.iter().filter(is_free).copied().collect()
     }
 
     /// Whether nothing else uses a line.
-    fn is_free(&self, pin: usize, spot: &Spot, way: &Way) -> bool {
+    fn is_free(&self, pin: usize, spot: &Slot, way: &Wiring) -> bool {
         let line = self.board.line(pin).and_then(|line| self.uses.names.line(line));
         line.is_some_and(|line| self.other(&Resource::Line(line), spot, way).is_none())
     }
@@ -150,8 +150,8 @@ impl Search<'_> {
     pub(super) fn wires(
         &self,
         device: &Device,
-        way: &Way,
-        spot: &Spot,
+        way: &Wiring,
+        spot: &Slot,
         written: &BTreeMap<String, String>,
         pin: Option<&str>,
     ) -> Result<Vec<Wire>, String> {

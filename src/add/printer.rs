@@ -18,7 +18,7 @@ use pinion_system::klippy::{Klippy, configs, klippys};
 use pinion_system::printer::{LINK, Printer};
 use pinion_system::uses::Use;
 
-use super::catalog::{Catalog, Device, Way};
+use super::catalog::{Catalog, Device, Wiring};
 use super::side::{Edit, MARK, Side};
 
 /// How high above the bed resonances are measured, in millimeters (docs/Measuring_Resonances.md of Klipper).
@@ -210,7 +210,7 @@ impl Target {
     }
 
     /// The values of a device's file that an earlier call has written, by the roles in its template.
-    pub(super) fn written_pins(&self, device: &Device, way: &Way, name: Option<&str>) -> BTreeMap<String, String> {
+    pub(super) fn written_pins(&self, device: &Device, way: &Wiring, name: Option<&str>) -> BTreeMap<String, String> {
         let own = self.file(&device.file(name));
         let template = device.named(&way.config, name);
         let mut section: Option<&Section> = None;

@@ -8,7 +8,7 @@ use pinion_firmware::board::{Board as _, BusDevice, BusError, BusStatus, I2cConf
 use pinion_linux::LinuxBoard;
 use pinion_linux::gpio::FastGpio;
 
-use super::catalog::{Catalog, Check, Detect, Fault, Read, Way};
+use super::catalog::{Catalog, Check, Detect, Fault, Read, Wiring};
 use pinion_system::board::Kind;
 
 /// How often a register is read. A loose wire answers differently each time.
@@ -36,7 +36,7 @@ pub(super) trait Buses {
     /// # Errors
     ///
     /// One line with cause and remedy.
-    fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String>;
+    fn spi(&mut self, way: &Wiring) -> Result<Box<dyn BusDevice>, String>;
 
     /// Opens an I2C address.
     ///
@@ -73,7 +73,7 @@ impl Live {
 }
 
 impl Buses for Live {
-    fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+    fn spi(&mut self, way: &Wiring) -> Result<Box<dyn BusDevice>, String> {
         let config = SpiConfig { bus: self.bus, mode: way.mode, rate_hz: way.rate_hz, chip_select: None };
         self.board.spi(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())
     }
@@ -89,7 +89,7 @@ impl Buses for Live {
 /// # Errors
 ///
 /// One line: the answer, its meaning and the remedy.
-pub(super) fn ask(catalog: &Catalog, way: &Way, addresses: &[u8], buses: &mut dyn Buses) -> Result<Answer, String> {
+pub(super) fn ask(catalog: &Catalog, way: &Wiring, addresses: &[u8], buses: &mut dyn Buses) -> Result<Answer, String> {
     let Some(check) = &way.check else {
         return Ok(Answer { text: "it cannot be asked: try it out".into(), address: None });
     };
@@ -360,7 +360,7 @@ mod tests {
     }
 
     impl Buses for Chips {
-        fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+        fn spi(&mut self, way: &Wiring) -> Result<Box<dyn BusDevice>, String> {
             let has_registers = !matches!(way.check, Some(Check::Fixed { register: None, .. }));
             Ok(Box::new(Chip { has_registers, answers: self.0[&0].clone(), next: 0, is_there: true }))
         }
@@ -543,7 +543,7 @@ mod tests {
     }
 
     impl Buses for Simulated {
-        fn spi(&mut self, way: &Way) -> Result<Box<dyn BusDevice>, String> {
+        fn spi(&mut self, way: &Wiring) -> Result<Box<dyn BusDevice>, String> {
             let bus = self.0.spi_buses().iter().find(|bus| bus.name == "spidev0.0").unwrap().first;
             let config = SpiConfig { bus, mode: way.mode, rate_hz: way.rate_hz, chip_select: None };
             self.0.spi(config).map(|opened| opened.device).map_err(|failure| failure.trouble.to_string())

@@ -7,14 +7,14 @@ use std::process::{Command, ExitStatus};
 
 use serde_json::json;
 
-use super::catalog::{Catalog, Device, Way, is_line};
+use super::catalog::{Catalog, Device, Wiring, is_line};
 use super::place::{Search, Wire};
 use super::printer::Target;
 use super::report::Report;
 use super::side::Side;
 use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
 use pinion_system::Computer;
-use pinion_system::board::{Board, Spot};
+use pinion_system::board::{Board, Slot};
 use pinion_system::files::Output;
 use pinion_system::instance::instances;
 use pinion_system::klippy::configs;
@@ -26,9 +26,9 @@ pub(super) struct Work<'a> {
     pub(super) catalog: &'a Catalog,
     pub(super) board: &'a Board,
     pub(super) device: &'a Device,
-    pub(super) way: &'a Way,
+    pub(super) way: &'a Wiring,
     /// The place on the bus.
-    pub(super) spot: Spot,
+    pub(super) spot: Slot,
     pub(super) search: Search<'a>,
     pub(super) report: &'a mut Report,
 }

@@ -18,7 +18,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use pinion_protocol::block::{Found, Resync};
+use pinion_protocol::block::{Resync, Resynced};
 use pinion_protocol::format;
 use pinion_protocol::vlq::Reader;
 use serde_json::{Map, Value, json};
@@ -210,9 +210,9 @@ fn configured(sent: &[u8], formats: &BTreeMap<u32, String>) -> Vec<String> {
         let (taken, found) = resync.next(rest);
         rest = &rest[taken..];
         let payload = match found {
-            Found::Nothing => return messages,
-            Found::Garbage { .. } => panic!("klippy wrote garbage"),
-            Found::Block(_, payload) => payload,
+            Resynced::Nothing => return messages,
+            Resynced::Garbage { .. } => panic!("klippy wrote garbage"),
+            Resynced::Block(_, payload) => payload,
         };
         let mut reader = Reader::new(payload);
         while !reader.is_empty() {

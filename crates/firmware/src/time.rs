@@ -120,7 +120,7 @@ pub struct Timing {
     /// The clock of the core and of the workers' jobs.
     pub clock: Arc<dyn TimeSource>,
     /// The due time of the running timer, which the MCU stores here.
-    pub due: Due,
+    pub due: DueTime,
     /// Longest delay of a timer before the MCU stops.
     pub late_limit: Ticks,
     /// Longest delay of a step before the MCU stops. A motor that is stepped too late loses steps.
@@ -130,35 +130,35 @@ pub struct Timing {
 impl Timing {
     /// Timing by this clock, with timers at most 100 ms late and steps at most 1 ms, as in Klipper's C.
     pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
-        Timing { clock, due: Due::default(), late_limit: Ticks::from_ms(100), step_late_limit: Ticks::from_ms(1) }
+        Timing { clock, due: DueTime::default(), late_limit: Ticks::from_ms(100), step_late_limit: Ticks::from_ms(1) }
     }
 }
 
 /// The due time of the running timer. The core sets it. A simulated printer reads it, so that a late computer does not
 /// affect its parts.
 #[derive(Clone, Debug)]
-pub struct Due(Arc<AtomicU64>);
+pub struct DueTime(Arc<AtomicU64>);
 
-impl Due {
+impl DueTime {
     /// The value while no timer runs. No time has these bits: they are 11,000 years ahead.
     const NO_TIMER: u64 = u64::MAX;
 
     /// Sets the due time of the running timer; `None` if no timer runs.
     #[inline]
     pub fn set(&self, due: Option<Clock>) {
-        self.0.store(due.map_or(Due::NO_TIMER, Clock::to_bits), Ordering::Relaxed);
+        self.0.store(due.map_or(DueTime::NO_TIMER, Clock::to_bits), Ordering::Relaxed);
     }
 
     /// The due time of the running timer; `None` if no timer runs.
     #[inline]
     pub fn get(&self) -> Option<Clock> {
-        Some(self.0.load(Ordering::Relaxed)).filter(|bits| *bits != Due::NO_TIMER).map(Clock::from_bits)
+        Some(self.0.load(Ordering::Relaxed)).filter(|bits| *bits != DueTime::NO_TIMER).map(Clock::from_bits)
     }
 }
 
-impl Default for Due {
-    fn default() -> Due {
-        Due(Arc::new(AtomicU64::new(Due::NO_TIMER)))
+impl Default for DueTime {
+    fn default() -> DueTime {
+        DueTime(Arc::new(AtomicU64::new(DueTime::NO_TIMER)))
     }
 }
 

@@ -77,7 +77,7 @@ fn front(bytes: &[u8]) -> Front<'_> {
 
 /// The result of [`Resync::next`].
 #[derive(Debug, PartialEq, Eq)]
-pub enum Found<'a> {
+pub enum Resynced<'a> {
     /// The bytes end before a block does.
     Nothing,
     /// An intact block.
@@ -98,20 +98,20 @@ pub struct Resync {
 
 impl Resync {
     /// How many bytes to remove from the front of `bytes`, and their content.
-    pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Found<'a>) {
+    pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Resynced<'a>) {
         if !self.need_sync {
             match front(bytes) {
-                Front::Incomplete => return (0, Found::Nothing),
+                Front::Incomplete => return (0, Resynced::Nothing),
                 Front::Block(sequence, payload) => {
                     self.need_valid = false;
-                    return (payload.len() + BLOCK_MIN, Found::Block(sequence, payload));
+                    return (payload.len() + BLOCK_MIN, Resynced::Block(sequence, payload));
                 }
                 // Sync bytes between blocks do not mean that bytes were lost.
-                Front::Garbage if bytes[0] == SYNC => return (1, Found::Garbage { first: false }),
+                Front::Garbage if bytes[0] == SYNC => return (1, Resynced::Garbage { first: false }),
                 Front::Garbage => self.need_sync = true,
             }
         } else if bytes.is_empty() {
-            return (0, Found::Nothing);
+            return (0, Resynced::Nothing);
         }
         let taken = match bytes.iter().position(|byte| *byte == SYNC) {
             Some(at) => {
@@ -122,7 +122,7 @@ impl Resync {
         };
         let first = !self.need_valid;
         self.need_valid = true;
-        (taken, Found::Garbage { first })
+        (taken, Resynced::Garbage { first })
     }
 }
 
@@ -164,15 +164,15 @@ impl Receiver {
     pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Received<'a>) {
         let (taken, found) = self.resync.next(bytes);
         let received = match found {
-            Found::Nothing => Received::Nothing,
-            Found::Block(sequence, payload) if sequence == self.expected => {
+            Resynced::Nothing => Received::Nothing,
+            Resynced::Block(sequence, payload) if sequence == self.expected => {
                 self.expected = sequence.next();
                 self.is_damaged = false;
                 Received::Payload(payload)
             }
-            Found::Block(..) => Received::Nak(if self.is_damaged { Refusal::Lost } else { Refusal::Repeated }),
-            Found::Garbage { first: false } => Received::Skip,
-            Found::Garbage { first: true } => {
+            Resynced::Block(..) => Received::Nak(if self.is_damaged { Refusal::Lost } else { Refusal::Repeated }),
+            Resynced::Garbage { first: false } => Received::Skip,
+            Resynced::Garbage { first: true } => {
                 self.is_damaged = true;
                 Received::Nak(Refusal::Garbage)
             }
@@ -301,7 +301,7 @@ mod tests {
 
     #[test]
     fn an_acknowledgement_is_found_without_more_bytes() {
-        assert_eq!(Resync::default().next(&block(&[], 3)), (BLOCK_MIN, Found::Block(Sequence(3), &[])));
+        assert_eq!(Resync::default().next(&block(&[], 3)), (BLOCK_MIN, Resynced::Block(Sequence(3), &[])));
     }
 
     #[test]
@@ -309,17 +309,17 @@ mod tests {
         let mut other = vec![BLOCK_MIN as u8, 0x20];
         other.extend_from_slice(&crc16_ccitt(&other).to_be_bytes());
         other.push(SYNC);
-        assert_eq!(Resync::default().next(&other), (BLOCK_MIN, Found::Garbage { first: true }));
+        assert_eq!(Resync::default().next(&other), (BLOCK_MIN, Resynced::Garbage { first: true }));
     }
 
     #[test]
     fn garbage_ends_with_the_next_sync_byte() {
         let mut resync = Resync::default();
-        assert_eq!(resync.next(b"garbage\x7e\x7e"), (8, Found::Garbage { first: true }));
-        assert_eq!(resync.next(b"\x7e\x10\0\0\0"), (1, Found::Garbage { first: false }));
-        assert_eq!(resync.next(b"no end"), (6, Found::Garbage { first: false }));
-        assert_eq!(resync.next(b""), (0, Found::Nothing));
-        assert_eq!(resync.next(b"\x06\x10 of it\x7e"), (9, Found::Garbage { first: false }));
+        assert_eq!(resync.next(b"garbage\x7e\x7e"), (8, Resynced::Garbage { first: true }));
+        assert_eq!(resync.next(b"\x7e\x10\0\0\0"), (1, Resynced::Garbage { first: false }));
+        assert_eq!(resync.next(b"no end"), (6, Resynced::Garbage { first: false }));
+        assert_eq!(resync.next(b""), (0, Resynced::Nothing));
+        assert_eq!(resync.next(b"\x06\x10 of it\x7e"), (9, Resynced::Garbage { first: false }));
     }
 
     #[test]

@@ -16,7 +16,7 @@
 //! use std::fs::File;
 //! use std::io::{self, Read, Write};
 //!
-//! use pinion_protocol::block::{Found, Resync, Sequence, frame};
+//! use pinion_protocol::block::{Resynced, Resync, Sequence, frame};
 //! use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 //! use pinion_protocol::vlq::{Reader, Writer};
 //!
@@ -43,9 +43,9 @@
 //!             loop {
 //!                 let (length, found) = self.resync.next(&self.received);
 //!                 let answer = match found {
-//!                     Found::Nothing => break,
-//!                     Found::Garbage { .. } => None,
-//!                     Found::Block(_, payload) => {
+//!                     Resynced::Nothing => break,
+//!                     Resynced::Garbage { .. } => None,
+//!                     Resynced::Block(_, payload) => {
 //!                         let mut reader = Reader::new(payload);
 //!                         let id = reader.int().map(|id| i64::from(id as i32));
 //!                         (id == Ok(response)).then(|| reader.rest().to_vec())

@@ -71,7 +71,7 @@ use self::core::heartbeat::Heartbeat;
 use self::core::responses::LinkWake;
 use self::core::start::{CoreThread, REQUESTS};
 use self::core::wakeup::MarginLimits;
-use self::core::{Left, Request};
+use self::core::{OutputState, Request};
 use link::handshake::Handshake;
 use link::host_end::HostEnd;
 use link::oversight::Oversight;
@@ -220,7 +220,7 @@ pub fn run(
 /// Ends the threads and processes in order. `served` is how the link ended.
 fn end(
     mut link: LinkThread,
-    core: JoinHandle<Left>,
+    core: JoinHandle<OutputState>,
     guardian: Option<Guardian>,
     served: Result<End, Trouble>,
 ) -> Result<(), Trouble> {
@@ -235,8 +235,8 @@ fn end(
     let left = core.join();
     link.finish();
     let failure = match left {
-        Ok(Left::Safe) => None,
-        Ok(Left::Pending(output)) => Some(
+        Ok(OutputState::Safe) => None,
+        Ok(OutputState::Pending(output)) => Some(
             Trouble::new(format!("{output} cannot be driven to its shutdown value: the guardian tries that now"))
                 .remedy("read its next line"),
         ),

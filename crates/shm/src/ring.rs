@@ -32,7 +32,7 @@ pub struct Ring<'a> {
 
 /// A ring's answer for one record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Found {
+pub enum Lookup {
     /// The record.
     Record(Record),
     /// It has not been written yet.
@@ -101,12 +101,12 @@ impl<'a> Ring<'a> {
     }
 
     /// The record with this number.
-    pub fn get(self, number: u64) -> Found {
+    pub fn get(self, number: u64) -> Lookup {
         if number >= self.next() {
-            return Found::NotYet;
+            return Lookup::NotYet;
         }
         let record = self.copy(number);
-        if number < self.oldest_whole() { Found::Overwritten } else { Found::Record(record) }
+        if number < self.oldest_whole() { Lookup::Overwritten } else { Lookup::Record(record) }
     }
 
     /// The newest records, the oldest of them first. A record that its writer overwrites meanwhile is left out.
@@ -185,7 +185,7 @@ mod tests {
         let words = zeros(8);
         let ring = Ring::new(&words);
         assert!(numbers(ring).is_empty());
-        assert_eq!(ring.get(0), Found::NotYet);
+        assert_eq!(ring.get(0), Lookup::NotYet);
         (0..3).for_each(|number| ring.push([number; 2]));
         assert_eq!(numbers(ring), [0, 1, 2]);
         (3..21).for_each(|number| ring.push([number; 2]));
@@ -193,7 +193,7 @@ mod tests {
         assert_eq!(numbers(ring), (14..21).collect::<Vec<_>>());
         assert_eq!(
             [13, 14, 20, 21].map(|number| ring.get(number)),
-            [Found::Overwritten, Found::Record([14; 2]), Found::Record([20; 2]), Found::NotYet]
+            [Lookup::Overwritten, Lookup::Record([14; 2]), Lookup::Record([20; 2]), Lookup::NotYet]
         );
     }
 
@@ -230,7 +230,7 @@ mod tests {
                 let numbers = numbers(ring);
                 assert!(numbers.windows(2).all(|two| two[0] + 1 == two[1]), "{numbers:?}");
                 let next = ring.next();
-                if let Found::Record(record) = ring.get(next.saturating_sub(60)) {
+                if let Lookup::Record(record) = ring.get(next.saturating_sub(60)) {
                     assert_eq!(record, [next.saturating_sub(60); 2]);
                 }
             }

@@ -15,7 +15,7 @@ use libc::{c_char, c_int, epoll_event, fd_set, nfds_t, pollfd, timespec, timeval
 
 use crate::clocks::{after, ns_of};
 use crate::real::real;
-use crate::threads::{Wait, Woken, is_one, wait, yield_token};
+use crate::threads::{Wait, WakeReason, is_one, wait, yield_token};
 use crate::turns::NEVER;
 
 /// Waits until a descriptor is ready.
@@ -30,7 +30,7 @@ unsafe fn await_any(fds: *mut pollfd, count: nfds_t, deadline_ns: u64) -> c_int 
         if ready != 0 || deadline_ns <= crate::turns::now_ns() {
             return ready;
         }
-        if wait(Wait::Descriptors(fds, count as usize), deadline_ns) == Woken::ByTime {
+        if wait(Wait::Descriptors(fds, count as usize), deadline_ns) == WakeReason::ByTime {
             return real!(fn poll(fds: *mut pollfd, count: nfds_t, ms: c_int) -> c_int);
         }
     }

@@ -8,7 +8,7 @@ use libc::{c_int, clockid_t, pthread_cond_t, pthread_mutex_t, sem_t, timespec};
 
 use crate::clocks::deadline;
 use crate::real::real;
-use crate::threads::{Wait, Woken, is_one, wait, wake};
+use crate::threads::{Wait, WakeReason, is_one, wait, wake};
 use crate::turns::{NEVER, now_ns};
 
 /// # Safety
@@ -46,7 +46,7 @@ pub unsafe extern "C" fn pthread_mutex_unlock(mutex: *mut pthread_mutex_t) -> c_
 unsafe fn await_signal(condition: *mut pthread_cond_t, mutex: *mut pthread_mutex_t, deadline_ns: u64) -> c_int {
     // SAFETY: the same contract.
     unsafe { pthread_mutex_unlock(mutex) };
-    let is_late = deadline_ns <= now_ns() || wait(Wait::Address(condition as usize), deadline_ns) == Woken::ByTime;
+    let is_late = deadline_ns <= now_ns() || wait(Wait::Address(condition as usize), deadline_ns) == WakeReason::ByTime;
     // SAFETY: the same contract.
     unsafe { pthread_mutex_lock(mutex) };
     if is_late { libc::ETIMEDOUT } else { 0 }
@@ -126,7 +126,7 @@ fn await_semaphore(semaphore: *mut sem_t, deadline_ns: u64) -> c_int {
         if std::io::Error::last_os_error().raw_os_error() != Some(libc::EAGAIN) {
             return -1;
         }
-        if deadline_ns <= now_ns() || wait(Wait::Address(semaphore as usize), deadline_ns) == Woken::ByTime {
+        if deadline_ns <= now_ns() || wait(Wait::Address(semaphore as usize), deadline_ns) == WakeReason::ByTime {
             // SAFETY: the address of this thread's error number.
             unsafe { *libc::__errno_location() = libc::ETIMEDOUT };
             return -1;

@@ -27,7 +27,7 @@ unsafe impl Send for Wait {}
 
 /// Why a thread goes on.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Woken {
+pub(crate) enum WakeReason {
     ByEvent,
     ByTime,
 }
@@ -44,7 +44,7 @@ struct Thread {
     state: State,
     wait: Wait,
     deadline_ns: u64,
-    woken: Woken,
+    woken: WakeReason,
     /// The order in which threads became ready or began to wait.
     order: u64,
     /// Set to 1 when the thread gets the token.
@@ -119,7 +119,7 @@ impl Threads {
             state: State::Ready,
             wait: Wait::Time,
             deadline_ns: NEVER,
-            woken: Woken::ByEvent,
+            woken: WakeReason::ByEvent,
             order: self.order,
             token,
         };
@@ -137,7 +137,7 @@ impl Threads {
         }
     }
 
-    fn ready(&mut self, place: usize, woken: Woken) {
+    fn ready(&mut self, place: usize, woken: WakeReason) {
         self.order += 1;
         let thread = &mut self.threads[place];
         if matches!(thread.wait, Wait::Address(_)) {
@@ -178,7 +178,7 @@ impl Threads {
                 .map(|(place, thread)| (thread.deadline_ns, thread.order, place))
                 .collect();
             due.sort_unstable();
-            due.iter().for_each(|(_, _, place)| self.ready(*place, Woken::ByTime));
+            due.iter().for_each(|(_, _, place)| self.ready(*place, WakeReason::ByTime));
         }
     }
 
@@ -199,7 +199,7 @@ impl Threads {
         }
         for (fd, owner) in all.iter().zip(owners) {
             if fd.revents != 0 && self.threads[owner].state == State::Waiting {
-                self.ready(owner, Woken::ByEvent);
+                self.ready(owner, WakeReason::ByEvent);
             }
         }
         true
@@ -219,7 +219,7 @@ fn await_token(token: &AtomicU32) {
 }
 
 /// Waits, and lets others run meanwhile.
-pub(crate) fn wait(wait: Wait, deadline_ns: u64) -> Woken {
+pub(crate) fn wait(wait: Wait, deadline_ns: u64) -> WakeReason {
     let me = ME.get();
     READINGS.set(0);
     let mut threads = lock();
@@ -242,11 +242,11 @@ pub(crate) fn yield_token() {
         return;
     }
     threads.threads[me].wait = Wait::Time;
-    threads.ready(me, Woken::ByEvent);
+    threads.ready(me, WakeReason::ByEvent);
     go_on(me, threads);
 }
 
-fn go_on(me: usize, mut threads: Table) -> Woken {
+fn go_on(me: usize, mut threads: Table) -> WakeReason {
     // SAFETY: the address of this thread's error number, which callers may still want.
     let error = unsafe { libc::__errno_location() };
     // SAFETY: the same.
@@ -278,7 +278,7 @@ pub(crate) fn wake(address: usize, most: usize) {
     for _ in 0..most {
         let at = threads.waiting().filter(|(_, thread)| matches!(thread.wait, Wait::Address(at) if at == address));
         let Some((place, _)) = at.min_by_key(|(_, thread)| thread.order) else { return };
-        threads.ready(place, Woken::ByEvent);
+        threads.ready(place, WakeReason::ByEvent);
     }
 }
 

@@ -183,13 +183,13 @@ pub struct Bus {
     #[serde(default)]
     pub overlays: Vec<Vec<String>>,
     /// Another chip select of the same controller.
-    also: Option<Spot>,
+    also: Option<Slot>,
 }
 
 /// A place on a bus for one device.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Spot {
+pub struct Slot {
     /// Its name in /dev, or below /sys.
     pub node: String,
     /// The header pin of each of its signals.
@@ -198,8 +198,8 @@ pub struct Spot {
 
 impl Bus {
     /// Its places for devices, the best one first.
-    pub fn spots(&self) -> impl Iterator<Item = Spot> {
-        [Spot { node: self.node.clone(), pins: self.pins.clone() }].into_iter().chain(self.also.clone())
+    pub fn spots(&self) -> impl Iterator<Item = Slot> {
+        [Slot { node: self.node.clone(), pins: self.pins.clone() }].into_iter().chain(self.also.clone())
     }
 
     /// All pins that it has when it is enabled.

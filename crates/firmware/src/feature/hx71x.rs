@@ -77,16 +77,16 @@ struct Shifted {
 }
 
 /// The way to the chip, on a worker.
-enum Way {
+enum Interface {
     Lines(Shift),
     Spi(Waves),
 }
 
-impl Way {
+impl Interface {
     fn take_warning(&mut self) -> Option<DeviceWarning> {
         match self {
-            Way::Lines(shift) => shift.warning.take(),
-            Way::Spi(waves) => waves.warning.take(),
+            Interface::Lines(shift) => shift.warning.take(),
+            Interface::Spi(waves) => waves.warning.take(),
         }
     }
 }
@@ -98,15 +98,15 @@ struct Read {
 }
 
 impl Job for Read {
-    type Device = Way;
+    type Device = Interface;
     /// `None`: no sample is ready.
     type Out = Option<Shifted>;
     type Failure = Shutdown;
 
-    fn run(&mut self, way: &mut Way) -> Result<Option<Shifted>, Shutdown> {
+    fn run(&mut self, way: &mut Interface) -> Result<Option<Shifted>, Shutdown> {
         let read = match way {
-            Way::Lines(shift) => shift.run().map(Some),
-            Way::Spi(waves) => waves.run(),
+            Interface::Lines(shift) => shift.run().map(Some),
+            Interface::Spi(waves) => waves.run(),
         };
         self.warning = way.take_warning();
         read
@@ -118,13 +118,13 @@ impl Job for Read {
 }
 
 /// The clock line while no sample is shifted out. High switches the chip off.
-impl Settable for Way {
+impl Settable for Interface {
     type Value = bool;
 
     fn set(&mut self, down: bool) -> Result<(), Shutdown> {
         match self {
-            Way::Lines(shift) => shift.power_down(down),
-            Way::Spi(waves) => waves.power_down(down),
+            Interface::Lines(shift) => shift.power_down(down),
+            Interface::Spi(waves) => waves.power_down(down),
         }
     }
 }
@@ -134,9 +134,9 @@ const POWER_DOWN: u8 = 1;
 const WATCH: u8 = 2;
 
 struct Hx71x {
-    way: DeviceId<Way>,
+    way: DeviceId<Interface>,
     gain_channel: u8,
-    power_down: Remote<Way>,
+    power_down: Remote<Interface>,
     /// Watches the pulses of a reading, on its own worker.
     watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>,
     /// Sent instead of samples until new measurements begin.
@@ -144,7 +144,11 @@ struct Hx71x {
 }
 
 impl Hx71x {
-    fn new(way: DeviceId<Way>, gain_channel: u8, watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>) -> Hx71x {
+    fn new(
+        way: DeviceId<Interface>,
+        gain_channel: u8,
+        watch: Option<(DeviceId<Watcher>, JobSlot<WatchReading>)>,
+    ) -> Hx71x {
         Hx71x { way, gain_channel, power_down: Remote::new(POWER_DOWN, way, true), watch, last_error: None }
     }
 }
@@ -225,7 +229,7 @@ fn configure(
             let cause = format!("{sclk} is no data output of an SPI device");
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
         };
-        let way = context.device(&bus, Box::new(Way::Spi(Waves::new(device, pulses, sclk))))?;
+        let way = context.device(&bus, Box::new(Interface::Spi(Waves::new(device, pulses, sclk))))?;
         let chip = Hx71x::new(way, gain_channel, None);
         return context.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::POLL, Read::default()));
     }
@@ -236,7 +240,7 @@ fn configure(
     let is_watched = sclk.is_fast() && context.has_parallel_workers();
     let watcher = is_watched.then(|| Watcher::new(context, sclk.clone()));
     let shift = Shift::new(context, sclk_pin, sclk, dout.clone(), pulses, watcher.as_ref());
-    let way = context.device(WORKER, Box::new(Way::Lines(shift)))?;
+    let way = context.device(WORKER, Box::new(Interface::Lines(shift)))?;
     let watch = match watcher {
         Some(watcher) => Some((context.device(WATCHER, Box::new(watcher))?, JobSlot::numbered(WATCH, WatchReading))),
         None => None,

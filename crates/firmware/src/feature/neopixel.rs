@@ -48,7 +48,7 @@ const RESET_MIN: Ticks = Ticks::from_us(300);
 const SIZE_LIMIT: u16 = 0x8000;
 
 /// The way to the LEDs.
-enum Way {
+enum Interface {
     Spi(Waves),
     Line(Pulses),
 }
@@ -60,15 +60,15 @@ struct Frame {
 }
 
 impl Job for Frame {
-    type Device = Way;
+    type Device = Interface;
     /// Whether the pulses had their times.
     type Out = bool;
     type Failure = Shutdown;
 
-    fn run(&mut self, way: &mut Way) -> Result<bool, Shutdown> {
+    fn run(&mut self, way: &mut Interface) -> Result<bool, Shutdown> {
         match way {
-            Way::Spi(waves) => waves.send(&self.data).map(|()| true),
-            Way::Line(pulses) => {
+            Interface::Spi(waves) => waves.send(&self.data).map(|()| true),
+            Interface::Line(pulses) => {
                 let sent = pulses.send(&self.data);
                 self.warning = pulses.warning.take();
                 sent
@@ -82,7 +82,7 @@ impl Job for Frame {
 }
 
 struct Neopixel {
-    way: DeviceId<Way>,
+    way: DeviceId<Interface>,
     data: Vec<u8>,
     frame: JobSlot<Frame>,
     /// Whether the log already has a line about failed sending.
@@ -131,18 +131,24 @@ impl Object for Neopixel {
 }
 
 /// The way to the LEDs at a pin.
-fn way(context: &mut Context, pin: Pin, size: usize, bit_max: Ticks, reset: Ticks) -> Result<DeviceId<Way>, Shutdown> {
+fn way(
+    context: &mut Context,
+    pin: Pin,
+    size: usize,
+    bit_max: Ticks,
+    reset: Ticks,
+) -> Result<DeviceId<Interface>, Shutdown> {
     let Some(mosi) = context.board()?.mosi(pin, spi::RATE_HZ)? else {
         let line = context.prompt_line(pin, "LED", Direction::Output { level: false, shutdown_value: false })?;
         let pulses = Pulses::new(context, pin, line, size, bit_max, reset)?;
-        return context.device(line::WORKER, Box::new(Way::Line(pulses)));
+        return context.device(line::WORKER, Box::new(Interface::Line(pulses)));
     };
     let Mosi { line: OnWorker { bus, device }, message_max, pauses } = mosi;
     let waves = Waves::new(device, size, reset, message_max).map_err(|error| error.of(&context.name(pin)))?;
     if let Some(trouble) = pauses {
         context.warn_of_device(&DeviceWarning::new("", trouble));
     }
-    context.device(&bus, Box::new(Way::Spi(waves)))
+    context.device(&bus, Box::new(Interface::Spi(waves)))
 }
 
 const CONFIG_NEOPIXEL: Command = command!(

@@ -91,12 +91,10 @@ fn bit_of(bits: &[u8], place: usize) -> bool {
 }
 
 /// The way to the drivers.
-enum Way {
+enum Interface {
     Lines(Lines),
     Port(Port),
 }
-
-impl Way {}
 
 /// Sends a message and receives its reply.
 #[derive(Default)]
@@ -106,15 +104,15 @@ struct Exchange {
 }
 
 impl Job for Exchange {
-    type Device = Way;
+    type Device = Interface;
     type Out = ();
     type Failure = Shutdown;
 
-    fn run(&mut self, way: &mut Way) -> Result<(), Shutdown> {
+    fn run(&mut self, way: &mut Interface) -> Result<(), Shutdown> {
         self.message.replied = false;
         match way {
-            Way::Lines(lines) => lines.exchange(&mut self.message),
-            Way::Port(port) => {
+            Interface::Lines(lines) => lines.exchange(&mut self.message),
+            Interface::Port(port) => {
                 port.exchange(&mut self.message);
                 self.warning = port.warning.take();
                 Ok(())
@@ -128,7 +126,7 @@ impl Job for Exchange {
 }
 
 struct TmcUart {
-    way: DeviceId<Way>,
+    way: DeviceId<Interface>,
     /// The wire, if no port drives it. A port is idle whenever it does not send.
     wire: Option<Wire>,
     pace: Pace,
@@ -230,13 +228,13 @@ const CONFIG_TMCUART: Command = command!(
             }
             Some(OnWorker { bus, device }) => {
                 let port = Port::new(device, context.name(rx_pin), bit_time);
-                (context.device(&bus, Box::new(Way::Port(port)))?, None, Pace::new(context))
+                (context.device(&bus, Box::new(Interface::Port(port)))?, None, Pace::new(context))
             }
             None => {
                 let bias = if pull_up { Bias::PullUp } else { Bias::None };
                 let lines = lines(context, rx_pin, tx_pin, bias, bit_time)?;
                 let (wire, pace) = (lines.wire.clone(), lines.pace.clone());
-                (context.device(WORKER, Box::new(Way::Lines(lines)))?, Some(wire), pace)
+                (context.device(WORKER, Box::new(Interface::Lines(lines)))?, Some(wire), pace)
             }
         };
         let exchange = JobSlot::new(Exchange::default());

@@ -19,7 +19,7 @@ use pinion_linux::clock::{monotonic, poll_timeout};
 
 use super::{Flow, Incoming, SILENCE_MAX, SYNC, Wire, read_some, write_some};
 use crate::process::signals::hang_up;
-use crate::transport::stdio::Lent;
+use crate::transport::stdio::StdioGuard;
 use crate::trouble::refused;
 
 /// How long the host's last bytes may wait for the MCU. A stop may be among them.
@@ -43,7 +43,7 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
     let lost = |error: io::Error| refused(link.display(), error).remedy(START);
     // Other programs may use them afterwards, with the same flags.
     let ends: Vec<i32> = hang_up().map_err(broken)?.into_iter().chain([SIGINT, SIGTERM]).collect();
-    let _lent = Lent::take(&ends)?;
+    let _lent = StdioGuard::take(&ends)?;
     let own = |fd: &dyn AsFd| fd.as_fd().try_clone_to_owned();
     let mut wire = own(&stdin).and_then(|stdin| Wire::new(stdin, own(&stdout)?)).map_err(broken)?;
     let mut inward = Flow::new();

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
-use pinion_protocol::block::{Found, Resync, Sequence};
+use pinion_protocol::block::{Resync, Resynced, Sequence};
 
 /// Highest number of blocks without an acknowledgement. The host sends at most 12.
 const UNACKNOWLEDGED_MAX: usize = 15;
@@ -69,9 +69,9 @@ impl Blocks {
         loop {
             let (bytes, next) = self.resync.next(&self.kept[taken..]);
             match next {
-                Found::Nothing => break,
-                Found::Block(sequence, _) => found(sequence),
-                Found::Garbage { .. } => {}
+                Resynced::Nothing => break,
+                Resynced::Block(sequence, _) => found(sequence),
+                Resynced::Garbage { .. } => {}
             }
             taken += bytes;
         }

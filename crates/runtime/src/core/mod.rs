@@ -27,7 +27,7 @@ use pinion_shm::progress::Progress;
 use crate::core::busy_poll::PollBudget;
 use crate::core::heartbeat::{BEAT, Heartbeat};
 use crate::core::responses::LinkWake;
-use crate::core::wakeup::{Waiter, Woken};
+use crate::core::wakeup::{Waiter, WakeReason};
 use crate::recorder::TraceWriter;
 use crate::status::SnapshotWriter;
 
@@ -100,7 +100,7 @@ enum Turn {
 
 /// The state of the outputs after the program was asked to end.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Left {
+pub(crate) enum OutputState {
     /// At their shutdown values.
     Safe,
     /// This output is not at its shutdown value, as far as is known.
@@ -129,7 +129,7 @@ impl Core {
     }
 
     /// Runs until it is asked to quit.
-    pub(crate) fn run(mut self) -> Left {
+    pub(crate) fn run(mut self) -> OutputState {
         self.trace_writer.start();
         let mut busy_since = self.mcu.now();
         let mut was_shutdown = false;
@@ -227,12 +227,12 @@ impl Core {
         // Near a timer, calls have to wait.
         match waiter.wait(now, deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
             // The edge must not wait for another read of the clock.
-            Woken::Due(now) => {
+            WakeReason::Due(now) => {
                 mcu.saw(now);
                 *yielded += 1;
                 now
             }
-            Woken::Called(now) => now,
+            WakeReason::Called(now) => now,
         }
     }
 
@@ -262,7 +262,7 @@ impl Core {
     }
 
     /// Waits until the outputs have their shutdown values.
-    fn end(mut self) -> Left {
+    fn end(mut self) -> OutputState {
         let deadline = monotonic() + LAST_WRITES;
         while self.mcu.has_pending_values() && monotonic() < deadline {
             self.mcu.run_timers();
@@ -271,7 +271,8 @@ impl Core {
             self.heartbeat.beat(self.mcu.now(), false);
             thread::sleep(Duration::from_millis(1));
         }
-        let left = self.mcu.pending_value().map_or(Left::Safe, |pending| Left::Pending(pending.to_owned()));
+        let left =
+            self.mcu.pending_value().map_or(OutputState::Safe, |pending| OutputState::Pending(pending.to_owned()));
         // This beat gives workers and devices time to end.
         self.heartbeat.beat(self.mcu.now(), false);
         left

@@ -18,7 +18,7 @@ use crate::core::heartbeat::Heartbeat;
 use crate::core::responses::{self, LinkWake};
 use crate::core::wakeup::{MarginLimits, Waiter};
 use crate::core::workers::Threads;
-use crate::core::{Core, Left, Parts};
+use crate::core::{Core, OutputState, Parts};
 use crate::link::core_end::CoreEnd;
 use crate::link::ledger::Ledger;
 use crate::process::realtime::{self, Processors, Role, Scheduling};
@@ -51,7 +51,7 @@ pub(crate) struct CoreThread {
 
 impl CoreThread {
     /// Starts the thread, and returns the link's end of it.
-    pub(crate) fn start(self) -> Result<(JoinHandle<Left>, CoreEnd), Trouble> {
+    pub(crate) fn start(self) -> Result<(JoinHandle<OutputState>, CoreEnd), Trouble> {
         let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
         let (response_ring, reader) = responses::response_ring(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);

@@ -54,7 +54,7 @@ impl TimeSource for Counting {
 
 /// A working core with an SPI device and a digital output, and a stand-in for its link.
 struct Rig {
-    thread: JoinHandle<Left>,
+    thread: JoinHandle<OutputState>,
     parker: Arc<Parker>,
     dialect: Arc<Dialect>,
     clock: Arc<Counting>,
@@ -157,7 +157,7 @@ impl Rig {
         self.request(request);
     }
 
-    fn quit(mut self) -> Left {
+    fn quit(mut self) -> OutputState {
         self.bench.hang(false);
         self.stop(Request::Quit(None));
         self.thread.join().unwrap()
@@ -250,7 +250,7 @@ fn a_transfer_holds_its_block_and_the_commands_behind_it_back() {
     }
     rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 23);
     assert_eq!(rig.said(RESPONSE).len(), 21);
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -271,7 +271,7 @@ fn what_is_only_sent_is_acknowledged_at_once_and_other_commands_wait_for_it() {
     assert!(rig.bench.level(30));
     let sent: Vec<_> = rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect();
     assert_eq!(sent, [[0], [1], [2]]);
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -287,7 +287,7 @@ fn a_block_is_acknowledged_while_a_bus_holds_the_next_one() {
     rig.wait_until_link_wakes();
     rig.wait_until("the transfer is under way", |rig| rig.bench.hangs());
     assert_eq!(rig.progress.done(), CONFIGURATION + 1);
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -298,7 +298,7 @@ fn the_link_is_told_of_a_block_without_a_response() {
     // The host waits for its acknowledgement.
     rig.wait_until_link_wakes();
     assert_eq!(rig.progress.done(), CONFIGURATION + 1);
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -311,7 +311,7 @@ fn a_stop_comes_after_the_blocks_before_it_if_no_bus_holds_them() {
     rig.wait_until("the MCU stops", Rig::is_stopped);
     let levels: Vec<u8> = rig.bench.edges(30).into_iter().map(|(_, level)| level).collect();
     assert_eq!(levels, [1, 0], "on, and its shutdown value");
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -328,7 +328,7 @@ fn the_core_sleeps_until_a_sample_is_due_and_does_not_spin_before_it() {
     let turns = rig.clock.1.load(Ordering::Relaxed) - turns;
     // There are 50 samples. A core awake 200 us before each would read the clock thousands of times.
     assert!(turns < 10_000, "the clock was read {turns} times");
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
@@ -394,12 +394,14 @@ fn an_emergency_stop_in_the_block_that_waits_is_seen_too() {
     let block = Payload::new(&[transfer.as_slice(), stop.as_slice()].concat());
     rig.stop(Request::Run(block));
     rig.wait_until("the MCU stops", Rig::is_stopped);
-    assert_eq!(rig.quit(), Left::Safe);
+    assert_eq!(rig.quit(), OutputState::Safe);
 }
 
 #[test]
 fn a_program_that_ends_waits_for_its_last_writes_and_says_what_failed() {
-    for (broken, left) in [(false, Left::Safe), (true, Left::Pending("digital output oid 1 (gpio30)".into()))] {
+    for (broken, left) in
+        [(false, OutputState::Safe), (true, OutputState::Pending("digital output oid 1 (gpio30)".into()))]
+    {
         let rig = Rig::new();
         if broken {
             rig.bench.state().broken.insert(30);

@@ -178,7 +178,7 @@ fn try_wake_ups(clock: &dyn TimeSource, parker: &Parker) -> i64 {
 
 /// Why a wait ended.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Woken {
+pub enum WakeReason {
     /// The instant came. This is the time now.
     Due(Clock),
     /// There is something else to do. This is the time now.
@@ -271,16 +271,16 @@ impl Waiter {
         deadline: Clock,
         exact: Option<Clock>,
         mut called: impl FnMut(Clock) -> bool,
-    ) -> Woken {
+    ) -> WakeReason {
         self.margin.approach(exact);
         let mut slept = deadline.since(now) < i64::from(self.margin.floor().0);
         let mut spins = false;
         loop {
             if now >= deadline {
-                return Woken::Due(now);
+                return WakeReason::Due(now);
             }
             if called(now) {
-                return Woken::Called(now);
+                return WakeReason::Called(now);
             }
             if !spins {
                 let wake_at = wake_at(deadline, exact, self.margin.get());
@@ -511,7 +511,7 @@ mod tests {
         let mut waiter =
             Waiter::new(clock.clone(), Arc::default(), MarginLimits::default(), Scheduling::Ordinary, processors);
         let deadline = clock.now() + Ticks::from_ms(1);
-        let Woken::Due(now) = waiter.wait(clock.now(), deadline, Some(deadline), |_| false) else {
+        let WakeReason::Due(now) = waiter.wait(clock.now(), deadline, Some(deadline), |_| false) else {
             panic!("nobody calls")
         };
         assert!(deadline <= now && now <= clock.now());
@@ -521,7 +521,7 @@ mod tests {
             asked = now;
             true
         });
-        assert_eq!(woken, Woken::Called(asked));
+        assert_eq!(woken, WakeReason::Called(asked));
         assert!(begin <= asked && asked < far);
     }
 

@@ -16,7 +16,7 @@ use pinion_linux::clock::monotonic;
 use crate::FIRMWARE;
 
 use crate::core::responses::LinkWake;
-use crate::host::search::{Found, HostFinder, HostSearch};
+use crate::host::search::{FoundHost, HostFinder, HostSearch};
 use crate::link::survey::{self, Surveyor};
 use crate::status::HostStatus;
 use crate::trouble::started;
@@ -128,7 +128,7 @@ impl Handshake {
             return Step::Done;
         };
         if self.is_finding
-            && let Some(Found { forms, is_other }) = self.finder.as_mut().and_then(HostFinder::answer)
+            && let Some(FoundHost { forms, is_other }) = self.finder.as_mut().and_then(HostFinder::answer)
         {
             self.is_finding = false;
             surveyor.make(forms);
@@ -161,7 +161,7 @@ impl Handshake {
     /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
         let answer = self.finder.as_mut().filter(|_| self.is_overdue).and_then(HostFinder::answer);
-        let Some(Found { forms, .. }) = answer else { return };
+        let Some(FoundHost { forms, .. }) = answer else { return };
         self.is_overdue = false;
         if forms != *self.first.forms() {
             warn!("the host's messages were found too late: send RESTART to use them");

@@ -124,7 +124,7 @@ pub(crate) struct LinkThread {
 
 /// The event that ended the link's sleep. The link reads only its descriptor: each read is a system call.
 #[derive(Clone, Copy, Debug)]
-struct Woken {
+struct PollEvents {
     by_oversight: bool,
     by_input: bool,
     /// The host is gone.
@@ -244,11 +244,11 @@ impl LinkThread {
     }
 
     /// Sleeps until there is something to do. `now` may be a little in the past: a read of the clock is not free.
-    fn wait(&mut self, stalled: bool, now: Duration) -> io::Result<Woken> {
+    fn wait(&mut self, stalled: bool, now: Duration) -> io::Result<PollEvents> {
         self.core.wake.sleeping();
         if self.core.has_news() && !self.host.is_full() || self.core.reader.has_line() {
             self.core.wake.awake(false);
-            return Ok(Woken { by_oversight: false, by_input: true, by_hangup: false });
+            return Ok(PollEvents { by_oversight: false, by_input: true, by_hangup: false });
         }
         let mut events = PollFlags::empty();
         if !stalled {
@@ -271,7 +271,7 @@ impl LinkThread {
             Err(error) => return Err(error.into()),
         }
         let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
-        let woken = Woken {
+        let woken = PollEvents {
             by_oversight: !events(&fds[2]).is_empty(),
             by_input: events(&fds[0]).intersects(PollFlags::POLLIN | PollFlags::POLLERR)
                 || due.is_some_and(|due| monotonic() >= due),

@@ -36,16 +36,16 @@ struct Before {
 }
 
 /// Standard input and output, in use until this is dropped. Then they are given back.
-pub(crate) struct Lent(());
+pub(crate) struct StdioGuard(());
 
-impl Lent {
+impl StdioGuard {
     /// Call this before the program changes one of them. `more` are signals that end the program at once, beside those
     /// that always do.
     ///
     /// # Errors
     ///
     /// The kernel refuses them, or a thread.
-    pub(crate) fn take(more: &[i32]) -> Result<Lent, Trouble> {
+    pub(crate) fn take(more: &[i32]) -> Result<StdioGuard, Trouble> {
         give_back_at_signal(more)?;
         let remember = |fd: BorrowedFd<'_>| -> io::Result<()> {
             let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
@@ -54,13 +54,13 @@ impl Lent {
             Ok(())
         };
         let both = remember(io::stdin().as_fd()).and_then(|()| remember(io::stdout().as_fd()));
-        both.map(|()| Lent(())).map_err(|error| {
+        both.map(|()| StdioGuard(())).map_err(|error| {
             refused("standard input and output cannot be used", error).remedy("let ssh or socat start Pinion")
         })
     }
 }
 
-impl Drop for Lent {
+impl Drop for StdioGuard {
     fn drop(&mut self) {
         give_back();
     }
@@ -92,7 +92,7 @@ fn give_back_at_signal(more: &[i32]) -> Result<(), Trouble> {
 
 /// Standard input and output.
 pub(crate) struct Stdio {
-    _lent: Lent,
+    _lent: StdioGuard,
     input: OwnedFd,
     output: OwnedFd,
     /// The output had no room. When to try again.
@@ -107,7 +107,7 @@ impl Stdio {
     /// They are the terminal that shows the log, or the kernel refuses them.
     pub(crate) fn open() -> Result<Stdio, Trouble> {
         can_use()?;
-        let lent = Lent::take(&[])?;
+        let lent = StdioGuard::take(&[])?;
         let opened = || -> io::Result<Stdio> {
             Ok(Stdio {
                 _lent: lent,

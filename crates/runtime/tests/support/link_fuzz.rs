@@ -14,7 +14,7 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{DialectName, Note, Outbox as _};
 use pinion_firmware::time::VirtualClock;
 use pinion_linux::clock::Monotonic;
-use pinion_protocol::block::{BLOCK_MAX, Found, PAYLOAD_MAX, Received, Receiver, Resync, Sequence, frame};
+use pinion_protocol::block::{BLOCK_MAX, PAYLOAD_MAX, Received, Receiver, Resync, Resynced, Sequence, frame};
 use pinion_shm::progress::Progress;
 
 use super::*;
@@ -235,9 +235,9 @@ impl Bench {
         loop {
             let (len, found) = self.resync.next(&self.heard);
             match found {
-                Found::Nothing => break,
-                Found::Garbage { .. } => panic!("the link wrote no block: {:?}", self.heard),
-                Found::Block(number, _) => {
+                Resynced::Nothing => break,
+                Resynced::Garbage { .. } => panic!("the link wrote no block: {:?}", self.heard),
+                Resynced::Block(number, _) => {
                     // Four bits of a number that never goes back, and that is never ahead of the taken blocks.
                     self.known = self.known.filter(|known| taken - known < 16).map(|known| {
                         let number = (known..=taken).find(|at| Sequence::after(*at) == number);

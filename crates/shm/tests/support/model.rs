@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed as Std};
 use crate::atomic::{AtomicU32, AtomicU64, Ordering};
 use crate::heartbeat::{SharedHeartbeat, WorkerSlot};
 use crate::progress::Progress;
-use crate::ring::{self, Found, Ring};
+use crate::ring::{self, Lookup, Ring};
 use crate::seqlock::Seqlock;
 use crate::sleep_flag::SleepFlag;
 use crate::watch::Watch;
@@ -87,9 +87,9 @@ fn a_record_is_itself_or_overwritten() {
             (ring.next(), ring.get(1), ring.next())
         },
         |_, (), (before, found, after)| match found {
-            Found::Record(record) => assert_eq!(record, [1; 2]),
-            Found::NotYet => assert!(before < 2),
-            Found::Overwritten => assert!(after > 2),
+            Lookup::Record(record) => assert_eq!(record, [1; 2]),
+            Lookup::NotYet => assert!(before < 2),
+            Lookup::Overwritten => assert!(after > 2),
         },
     );
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use pinion_firmware::time::{CLOCK_FREQ, Clock, Due, NS_PER_TICK, Ticks, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, DueTime, NS_PER_TICK, Ticks, TimeSource};
 
 /// Seconds from `earlier` to `later`; 0 if they are the other way round.
 pub fn seconds(earlier: Clock, later: Clock) -> f64 {
@@ -104,7 +104,7 @@ thread_local! {
 /// the steps that make an axis ring.
 pub(crate) struct PrinterTime {
     clock: Arc<dyn TimeSource>,
-    due: Due,
+    due: DueTime,
     drift: Drift,
 }
 
@@ -112,11 +112,11 @@ impl PrinterTime {
     /// The time of a board whose clock drifts from this one.
     pub(crate) fn new(clock: Arc<dyn TimeSource>, drift: Drift) -> PrinterTime {
         let clock = if drift.most == 0.0 { clock } else { Arc::new(BoardClock { clock, drift }) };
-        PrinterTime { clock, due: Due::default(), drift }
+        PrinterTime { clock, due: DueTime::default(), drift }
     }
 
     /// The MCU sets this to the due time of the timer that it runs.
-    pub(crate) fn due(&self) -> Due {
+    pub(crate) fn due(&self) -> DueTime {
         self.due.clone()
     }
 

@@ -7,7 +7,7 @@
 use std::sync::atomic::AtomicU64;
 
 use pinion_firmware::time::Clock;
-use pinion_shm::ring::{Found, Ring, words};
+use pinion_shm::ring::{Lookup, Ring, words};
 
 /// Number of steps kept: half a second at 32,000 steps per second.
 pub(crate) const KEPT: usize = 1 << 14;
@@ -38,9 +38,9 @@ impl Track {
     /// The step with this number.
     pub(crate) fn get(&self, step: u64) -> Recorded {
         match self.ring().get(step) {
-            Found::Record([at, position]) => Recorded::Step(Clock::from_ticks(at), position as i64),
-            Found::NotYet => Recorded::NotYet,
-            Found::Overwritten => Recorded::Overwritten,
+            Lookup::Record([at, position]) => Recorded::Step(Clock::from_ticks(at), position as i64),
+            Lookup::NotYet => Recorded::NotYet,
+            Lookup::Overwritten => Recorded::Overwritten,
         }
     }
 }

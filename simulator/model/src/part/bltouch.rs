@@ -137,7 +137,7 @@ const COMMANDS: [(f64, Command); 8] = [
 
 /// The pin's target.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Way {
+enum Target {
     Up,
     Down,
     SelfTest,
@@ -146,7 +146,7 @@ enum Way {
 /// The probe's whole state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct State {
-    way: Way,
+    way: Target,
     /// When the pin started to move.
     since: Clock,
     touch_mode: bool,
@@ -180,7 +180,7 @@ impl State {
     fn of([flags, since, touched, rise, commanded]: [u64; 5]) -> State {
         let command = flags >> 6;
         State {
-            way: [Way::Up, Way::Down, Way::SelfTest, Way::Up][(flags & 3) as usize],
+            way: [Target::Up, Target::Down, Target::SelfTest, Target::Up][(flags & 3) as usize],
             since: Clock::from_ticks(since),
             touch_mode: flags & 4 != 0,
             alarm: flags & 8 != 0,
@@ -206,7 +206,7 @@ impl Bltouch {
     fn new(config: &BltouchConfig, bed: Bed) -> Bltouch {
         let start = Clock::from_ticks(0);
         let state = State {
-            way: Way::Up,
+            way: Target::Up,
             since: start,
             touch_mode: false,
             alarm: false,
@@ -237,23 +237,23 @@ impl Bltouch {
             return state;
         }
         if state.falls && !self.is_against_the_bed() {
-            (state.way, state.falls) = (Way::Down, false);
+            (state.way, state.falls) = (Target::Down, false);
         }
         match state.way {
-            Way::Up => state.alarm = self.jams == Some(Jam::Down) && !state.touch_mode,
-            Way::SelfTest if elapsed_s >= 2.0 * SELF_TEST_ROUNDS * self.move_s => state.way = Way::Up,
-            Way::SelfTest => state.alarm = self.jams.is_some(),
-            Way::Down if self.jams == Some(Jam::Up) => {
+            Target::Up => state.alarm = self.jams == Some(Jam::Down) && !state.touch_mode,
+            Target::SelfTest if elapsed_s >= 2.0 * SELF_TEST_ROUNDS * self.move_s => state.way = Target::Up,
+            Target::SelfTest => state.alarm = self.jams.is_some(),
+            Target::Down if self.jams == Some(Jam::Up) => {
                 state.alarm = true;
-                state.way = Way::Up;
+                state.way = Target::Up;
             }
-            Way::Down if self.is_against_the_bed() && !state.touch_mode => {
-                state.way = Way::Up;
+            Target::Down if self.is_against_the_bed() && !state.touch_mode => {
+                state.way = Target::Up;
                 state.since = now;
                 state.touched = Some(now);
                 state.falls = true;
             }
-            Way::Down => {}
+            Target::Down => {}
         }
         state
     }
@@ -264,9 +264,9 @@ impl Bltouch {
         match (self.jams, state.way) {
             (Some(Jam::Up), _) => true,
             (Some(Jam::Down), _) => false,
-            (None, Way::Up) => moves >= 1.0,
-            (None, Way::Down) => moves < 1.0 || self.is_against_the_bed(),
-            (None, Way::SelfTest) => moves % 2.0 < 1.0,
+            (None, Target::Up) => moves >= 1.0,
+            (None, Target::Down) => moves < 1.0 || self.is_against_the_bed(),
+            (None, Target::SelfTest) => moves % 2.0 < 1.0,
         }
     }
 
@@ -312,18 +312,18 @@ impl Bltouch {
             return;
         }
         let way = match command {
-            Command::PinDown => Way::Down,
-            Command::SelfTest => Way::SelfTest,
-            _ => Way::Up,
+            Command::PinDown => Target::Down,
+            Command::SelfTest => Target::SelfTest,
+            _ => Target::Up,
         };
         if state.way != way || self.jams.is_some() {
             state.way = way;
             state.since = at;
         }
         // A pin against the bed has no room to go down.
-        state.alarm = way == Way::Down && self.is_against_the_bed();
+        state.alarm = way == Target::Down && self.is_against_the_bed();
         if state.alarm {
-            state.way = Way::Up;
+            state.way = Target::Up;
         }
     }
 }
@@ -558,7 +558,7 @@ mod tests {
         let state = State {
             touched: Some(bench.now),
             command: Some(7),
-            way: Way::SelfTest,
+            way: Target::SelfTest,
             falls: true,
             ..bench.probe.at(bench.now)
         };

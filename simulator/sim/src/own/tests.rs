@@ -299,8 +299,9 @@ fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
     let text = |more: &str| PRINTER.replace("[probe]", &format!("{klicky}[probe]")).replace("[extruder]", more);
     let of = |text: &str, kind: &str, key: &str, value: &str| -> Table {
         let description = translated(text).unwrap().description;
-        let all = description[kind].as_array().unwrap().iter().filter_map(Value::as_table);
-        all.cloned().find(|table| table.get(key).and_then(Value::as_str) == Some(value)).unwrap()
+        let mut all = description[kind].as_array().unwrap().iter().filter_map(Value::as_table);
+        let has = |table: &&Table| table.get(key).and_then(Value::as_str) == Some(value);
+        all.find(has).cloned().unwrap()
     };
     let probe = of(&text("[extruder]"), "part", "kind", "probe");
     assert_eq!(probe["dock_mm"].as_array().unwrap(), &[Value::from(-21.0), Value::from(370.5)]);

@@ -13,7 +13,7 @@ use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::termios::{self, FlushArg, SetArg};
 use nix::sys::time::TimeSpec;
-use pinion_protocol::block::{Found, Resync, Sequence, frame};
+use pinion_protocol::block::{Resync, Resynced, Sequence, frame};
 
 use crate::Error;
 
@@ -118,9 +118,9 @@ impl Port {
         loop {
             let (taken, found) = self.resync.next(&self.input);
             let block = match found {
-                Found::Nothing => return None,
-                Found::Block(sequence, payload) => Some((sequence, payload.to_vec())),
-                Found::Garbage { .. } => {
+                Resynced::Nothing => return None,
+                Resynced::Block(sequence, payload) => Some((sequence, payload.to_vec())),
+                Resynced::Garbage { .. } => {
                     self.garbage += taken as u64;
                     None
                 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::serial::{BlockLink, Port};
-use pinion_protocol::block::{Found, Received, Receiver, Resync, Sequence, frame};
+use pinion_protocol::block::{Received, Receiver, Resync, Resynced, Sequence, frame};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::vlq::{Reader, Writer};
 
@@ -70,9 +70,9 @@ fn serve(
         loop {
             let (taken, found) = resync.next(&input);
             let block = match found {
-                Found::Nothing => break,
-                Found::Block(sequence, payload) => Some((sequence, payload.to_vec())),
-                Found::Garbage { .. } => None,
+                Resynced::Nothing => break,
+                Resynced::Block(sequence, payload) => Some((sequence, payload.to_vec())),
+                Resynced::Garbage { .. } => None,
             };
             input.drain(..taken);
             let Some((sequence, payload)) = block else {

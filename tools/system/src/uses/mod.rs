@@ -15,7 +15,7 @@ use pinion_printer_config::Section;
 use serde_json::{Value, json};
 
 use super::Computer;
-use super::board::{self, Board, Kind, Spot};
+use super::board::{self, Board, Kind, Slot};
 use super::klippy::configs;
 use super::printer::{self, Printer};
 
@@ -284,7 +284,7 @@ impl Uses {
     }
 
     /// The pins of a place. 1-Wire and PWM are where config.txt has them.
-    pub fn pins(&self, board: &Board, spot: &Spot) -> BTreeMap<String, usize> {
+    pub fn pins(&self, board: &Board, spot: &Slot) -> BTreeMap<String, usize> {
         let function = board::function(&spot.node);
         let own = self.all.iter().find(|one| one.source == Source::Boot && one.function.as_deref() == Some(&*function));
         match (function.as_str(), own.map(|one| &one.what)) {

@@ -88,16 +88,16 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
 }
 
 /// What the search found out about a host.
-pub(crate) struct Found {
+pub(crate) struct FoundHost {
     /// The forms of messages for it.
     pub(crate) forms: Forms,
     /// The process of the host before is gone, and this is another one.
     pub(crate) is_other: bool,
 }
 
-impl Found {
+impl FoundHost {
     /// Nothing is known.
-    const NOTHING: Found = Found { forms: Forms::Dialect(DialectName::Union), is_other: false };
+    const NOTHING: FoundHost = FoundHost { forms: Forms::Dialect(DialectName::Union), is_other: false };
 }
 
 /// The link's way to the search. A thread receives the answers.
@@ -105,7 +105,7 @@ pub(crate) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
     board: Arc<HostStatus>,
-    answers: Receiver<(u32, Found)>,
+    answers: Receiver<(u32, FoundHost)>,
     /// The number of the last question.
     asked: u32,
     /// The last question waits until the search has answered the one before it. A host may come and go at any rate, and
@@ -135,7 +135,7 @@ impl HostFinder {
                 for line in &answer.lines {
                     log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
                 }
-                let found = Found { forms: answer.forms(), is_other: answer.is_other };
+                let found = FoundHost { forms: answer.forms(), is_other: answer.is_other };
                 shown.found(answer.host);
                 let sent = sender.send((answer.number, found));
                 wake.wake();
@@ -163,7 +163,7 @@ impl HostFinder {
     }
 
     /// The answer to the last question, if it has come.
-    pub(crate) fn answer(&mut self) -> Option<Found> {
+    pub(crate) fn answer(&mut self) -> Option<FoundHost> {
         loop {
             match self.answers.try_recv() {
                 Ok((number, found)) => {
@@ -173,7 +173,7 @@ impl HostFinder {
                     }
                 }
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => return Some(Found::NOTHING),
+                Err(TryRecvError::Disconnected) => return Some(FoundHost::NOTHING),
             }
         }
         if self.waits && !self.is_busy {
