@@ -14,14 +14,13 @@ fn klippy_homes_heats_and_moves() {
     let toolhead = printer.object("toolhead");
     assert_eq!(toolhead["homed_axes"], "xyz");
     assert_eq!(toolhead["position"][0], 50.0);
-    // The bed heats in the background, and the hot end to its target. verify_heater watches both.
-    printer.gcode("M140 S45\nM109 S180");
-    let extruder = printer.object("extruder")["temperature"].as_f64().unwrap();
-    assert!((extruder - 180.0).abs() < 5.0, "{extruder}");
-    printer.gcode("G92 E0\nG1 X100 E5 F1200\nG1 X20 Y20 E10\nM400\nM190 S45");
-    let bed = printer.object("heater_bed")["temperature"].as_f64().unwrap();
-    assert!((bed - 45.0).abs() < 3.0, "{bed}");
-    printer.gcode("M106 S128\nSET_LED LED=light RED=0.5 WHITE=0.5\nM400\nTURN_OFF_HEATERS");
+    // verify_heater watches both heaters. That they reach their targets is tested in one clock.
+    printer.gcode("M140 S60\nM104 S180");
+    printer.until_heating("heater_bed");
+    printer.until_heating("extruder");
+    printer.gcode(
+        "G1 X100 F1200\nG1 X20 Y20\nM400\nM106 S128\nSET_LED LED=light RED=0.5 WHITE=0.5\nM400\nTURN_OFF_HEATERS",
+    );
     assert_eq!(printer.state(), "ready");
 }
 
