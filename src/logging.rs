@@ -88,7 +88,7 @@ impl Queue {
     fn take(&mut self, record: &Record<'_>, style: Style, now: Duration) {
         self.report(style, now);
         if record.level() > Level::Info {
-            // Whoever asks for details gets all of them.
+            // The levels below Info are details: all of them are logged.
             return self.push(style.line(record.level(), *record.args()));
         }
         let (target, place) = (record.target(), record.line());

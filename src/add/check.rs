@@ -34,7 +34,7 @@ impl Work<'_> {
             if let Some(user) = self.computer.user("pinion")
                 && !user.may(Access::READ_WRITE, &about)
             {
-                checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says what is missing"));
+                checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says why"));
             }
         }
         checks.extend(strays(self.computer, self.board, &self.spot));

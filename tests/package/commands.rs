@@ -65,7 +65,7 @@ pub fn each_page(checks: Vec<Check>) -> Result<Vec<Check>, String> {
     }
 }
 
-/// Whether the check tries pages of which nothing can be tried. It would only install the package.
+/// Whether the check tries pages without a block to try. It would only install the package.
 pub fn has_nothing_to_try(check: &Check) -> bool {
     let can_be_tried =
         |page: &Page| page.blocks().iter().any(|block| block.kind == COMMANDS && block.not_tried.is_none());

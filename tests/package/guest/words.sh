@@ -40,7 +40,7 @@ light() {
 }
 dark() { pkill -f '/share/host light' || true; }
 sockets() { ls /run/pinion/*.sock /run/pinion/*.trace; }
-# hold COUNT SECONDS: klippy's user opens each socket so often, within that time, and keeps it open.
+# hold COUNT SECONDS: klippy's user opens each socket COUNT times within SECONDS, and keeps it open.
 hold() {
     cat >/run/hold.py <<'END'
 import socket, sys, time

@@ -50,8 +50,8 @@ pub fn read(path: &Path, mib_max: u64) -> io::Result<Vec<u8>> {
 
 /// A file to write. There is none until it is written.
 ///
-/// The file is reached below the descriptor of its folder. Whoever may rename files on the way to it, as everybody may
-/// in /tmp, could otherwise have another user replace a file elsewhere.
+/// The file is reached below the descriptor of its folder. Otherwise a user who may rename files on the way to it, as
+/// every user may in /tmp, could make another user replace a file elsewhere.
 pub struct Output {
     /// As the command line names it.
     path: PathBuf,

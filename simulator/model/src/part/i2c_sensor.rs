@@ -223,7 +223,7 @@ impl I2cChip for Sensor {
     }
 }
 
-/// A value with 16 bits of which the last two are a status, and its checksum.
+/// A value with 16 bits, and its checksum. The last two bits are a status.
 fn checked((share, status): (f64, u16), start: u8) -> Vec<u8> {
     // The clamp keeps the value in the range of a u16, so the cast loses nothing.
     let value = (share * 65536.0).round().clamp(0.0, 65535.0) as u16 & !3 | status;

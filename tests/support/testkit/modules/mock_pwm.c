@@ -5,7 +5,7 @@
  * In /sys/devices/platform/mock-pwm:
  *   fail      written: an errno with which each change fails, or 0
  *   outputs   one line per channel, "CHANNEL PERIOD_NS DUTY_NS ENABLED WRITES":
- *             what the pins would do, whoever has the channel exported
+ *             what the pins would do, also if another program exported the channel
  *   history   the first changes since anything was written to it,
  *             "CHANNEL PERIOD_NS DUTY_NS ENABLED" each
  */

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The names of a computer's lines: one name for each line, whoever names it and however.
+//! The names of a computer's lines: one name for each line, from every source and in every form.
 
 use std::collections::BTreeMap;
 

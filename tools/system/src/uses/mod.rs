@@ -392,7 +392,7 @@ impl Uses {
         self.all.iter().filter(move |one| one.what == *what)
     }
 
-    /// The overlays and configurations of which nobody knows what they take.
+    /// The overlays and configurations whose pins are not known.
     pub fn unknown(&self) -> impl Iterator<Item = &Use> {
         self.all.iter().filter(|one| matches!(one.what, Resource::Unknown(_)))
     }
