@@ -70,7 +70,7 @@ fn lets_hang() -> bool {
     std::env::var_os("PINION_TEST_HANG").is_some()
 }
 
-/// The signals that end the program at once, but for crashes. systemd sends SIGQUIT to a program that hangs.
+/// The signals that end the program at once, except those of crashes. systemd sends SIGQUIT to a program that hangs.
 pub(crate) fn deadly() -> Vec<i32> {
     let usr2 = (!lets_hang()).then_some(SIGUSR2);
     [SIGQUIT, SIGALRM, SIGVTALRM, SIGPROF, SIGXCPU, SIGXFSZ].into_iter().chain(usr2).collect()
