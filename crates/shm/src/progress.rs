@@ -47,7 +47,7 @@ impl Progress {
         self.config.store(config, Ordering::Relaxed);
     }
 
-    /// The core is about to send a response. So whoever sees the response does not see an older answer.
+    /// The core is about to send a response. A thread that sees the response does not see an older answer.
     pub fn withdraw(&self) {
         if self.config.load(Ordering::Relaxed) != 0 {
             self.config.store(0, Ordering::Relaxed);
