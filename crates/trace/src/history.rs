@@ -398,8 +398,8 @@ pub(super) mod tests {
         trace
     }
 
-    /// A print that stops at 0, after 1 s. 18 motors step; the first ones step last. A heater has PWM pulses, and the fan
-    /// is on for so long that the recording has forgotten its edge. The outputs change 20 to 78 us after it.
+    /// A print that stops at 0, after 1 s. 18 motors step; the first ones step last. A heater has PWM pulses. The
+    /// recording has forgotten the fan's edge, which is long ago. The outputs change 20 to 78 us after it.
     pub(crate) fn stopped_print() -> Trace {
         const STOP: u64 = 1_000_000;
         let edge = |at: u64, pin: u32, level: bool| (at, Event::Edge { pin, level });
