@@ -2,8 +2,8 @@
 //! The verdict over a trace: who was late, by how much, and what to do about it.
 //!
 //! A stop that is about a time has a span in which it went wrong. It begins when the work was due, or when the host's
-//! block came, and ends with the stop. Whoever took at least half of this span is the culprit. Without evidence against
-//! anybody the verdict says what is known, and accuses nobody.
+//! block came, and ends with the stop. A thread or program that took at least half of this span is the culprit. If
+//! the cause is unclear, the verdict lists facts only.
 
 use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::Ticks;
