@@ -40,8 +40,8 @@ pub(super) fn homed(trial: &mut Trial<'_>) -> Seen {
     Ok(format!("G28: the nozzle is at {x:.2} {y:.2} {z:.2}"))
 }
 
-/// How far klippy's position is from the nozzle's along the axes of which `[homing_override]` only says where they are: a
-/// belt. `homed` has checked that the others agree.
+/// How far klippy's position is from the nozzle's along the axes whose position `[homing_override]` only sets: a belt.
+/// `homed` has checked that the others agree.
 pub(super) fn said_mm(trial: &mut Trial<'_>) -> Result<[f64; 3], Outcome> {
     let klippys = coordinates(&trial.toolhead()?["position"]);
     let nozzle = trial.probe.nozzle_mm();
