@@ -72,7 +72,7 @@ impl<'a> Trial<'a> {
     pub(super) fn failed(&self, cause: impl Into<String>, place: Option<Place>) -> Outcome {
         let cause = cause.into();
         let place = place.or_else(|| place_of(self.config(), &cause));
-        // klippy's words have several lines, of which the first ones say it.
+        // klippy's message has several lines. The first ones name the cause.
         let lines: Vec<&str> = cause.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
         let cause = lines.iter().take(2).copied().collect::<Vec<&str>>().join(" ");
         Outcome::Failed { cause, place }
