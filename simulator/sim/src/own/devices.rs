@@ -245,7 +245,7 @@ impl Translator<'_> {
         Ok(())
     }
 
-    /// Strips on a data line each: an SPI bus of which only the output is in use. They come last, because klippy takes the
+    /// Strips on a data line each: an SPI bus where only the output is in use. They come last, because klippy takes the
     /// first bus where a section names none.
     pub(super) fn strips(&mut self) -> Result<(), Trouble> {
         for section in self.config.of_kind("neopixel") {
