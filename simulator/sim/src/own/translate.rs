@@ -54,7 +54,7 @@ pub(super) fn check(config: &Config) -> Result<(), Trouble> {
     claims::check(config, &Aliases::read(config)?, &mcus(config)?)
 }
 
-/// Translates a configuration. The printer has all of it, but for a plain probe in the place of a plugin's.
+/// Translates a configuration. The printer has all of it, except a plugin's probe: a plain probe replaces it.
 ///
 /// # Errors
 ///
