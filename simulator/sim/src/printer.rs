@@ -196,7 +196,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(path) => path,
         Err(error) => return failed(format!("the path cannot be recorded: {error}")),
     };
-    // Whoever waits for exact steps spins. A trial has time for a step that is 50 us late, and computers with two
+    // An MCU that waits for exact steps spins. A trial has time for a step that is 50 us late, and computers with two
     // processors have no time for several MCUs that spin.
     let is_tried = owner.as_ref().is_some_and(|owner| owner.attempt.is_some());
     let options = Options {
