@@ -49,7 +49,7 @@ impl Work<'_> {
             (Some(Check::Iio { file, highest }), _) => self.sample(file, *highest),
             (Some(_), false) => match probe::Live::of(&node) {
                 Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &addresses, &mut live)),
-                None => Err(format!("{node} is no bus")),
+                None => Err(format!("{node} is not a bus")),
             },
             _ => Ok(Answer { text: "it cannot be asked: try it out".into(), address: None }),
         };
