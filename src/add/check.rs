@@ -34,7 +34,7 @@ impl Work<'_> {
             if let Some(user) = self.computer.user("pinion")
                 && !user.may(Access::READ_WRITE, &about)
             {
-                checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says what is missing"));
+                checks.push(format!("Pinion's user may not open {path}: sudo pinion doctor says why"));
             }
         }
         checks.extend(strays(self.computer, self.board, &self.spot));
@@ -49,7 +49,7 @@ impl Work<'_> {
             (Some(Check::Iio { file, highest }), _) => self.sample(file, *highest),
             (Some(_), false) => match probe::Live::of(&node) {
                 Some(mut live) => quietly(|| probe::ask(self.catalog, self.way, &addresses, &mut live)),
-                None => Err(format!("{node} is no bus")),
+                None => Err(format!("{node} is not a bus")),
             },
             _ => Ok(Answer { text: "it cannot be asked: try it out".into(), address: None }),
         };

@@ -175,7 +175,7 @@ fn present(computer: &Computer, config_txt: &ConfigTxt, class: &Class) -> Findin
     if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(computer, class, node)?))) {
         let node = computer.name(node);
         let (shown, subsystem) = (node.display(), class.subsystem);
-        let found = format!("{name}: {shown} is no {subsystem} device, but one of {other}");
+        let found = format!("{name}: {shown} is not a {subsystem} device, but one of {other}");
         let remedy =
             format!("sudo rm {} && sudo udevadm trigger --action=add --subsystem-match={subsystem}", word(shown));
         return Finding::error(check, found, remedy);
@@ -355,7 +355,7 @@ mod tests {
         tree.link("dev/gpiochip0", "/dev/null");
         says(&present(&tree), "gpio", Fine, "GPIO: /dev/gpiochip0");
         tree.link("sys/dev/char/1:3/subsystem", "../../../../class/mem");
-        let remedy = says(&present(&tree), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
+        let remedy = says(&present(&tree), "gpio", Error, "/dev/gpiochip0 is not a gpio device, but one of mem");
         assert!(remedy.starts_with("sudo rm /dev/gpiochip0 && sudo udevadm trigger"), "{remedy}");
         fs::remove_file(tree.computer().path("/sys/dev/char/1:3/subsystem")).unwrap();
         tree.link("sys/dev/char/1:3/subsystem", "../../../../bus/gpio");

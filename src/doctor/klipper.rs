@@ -60,7 +60,7 @@ pub(super) fn report(checkout: &Checkout, page: &mut Page) {
     page.line(format_args!("This host looks up {} forms of messages.", checkout.shapes.len()));
     page.line("");
     if let Some(unread) = &checkout.unread {
-        page.line(format_args!("Not all of it can be read, and what is left out here does not count: {unread}"));
+        page.line(format_args!("Some of the host's sources cannot be read, and their messages do not count: {unread}"));
         page.line("");
     }
     let missing = missing(checkout);

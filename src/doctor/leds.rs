@@ -87,7 +87,7 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
     let mut about = fs::metadata(computer.path(&node)).ok().zip(instance.user(computer)).into_iter();
     if let Some((_, user)) = about.find(|(about, user)| wish != FastGpio::DevMem && !user.may(FAST.access, about)) {
         let why = format!("{} may not open {}", user.name, node.display());
-        return refused(&why, set("on") + ": pinion doctor then says what is missing");
+        return refused(&why, set("on") + ": pinion doctor then names the missing permission");
     }
     Finding::ok(
         CHECK,

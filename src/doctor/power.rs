@@ -18,7 +18,7 @@ pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding
             true => {
                 vec![Finding::warning(CHECK, "whether the power is good is unknown", "sudo vcgencmd get_throttled")]
             }
-            false => vec![Finding::ok(CHECK, "whether the power is good is unknown: this is no Raspberry Pi")],
+            false => vec![Finding::ok(CHECK, "whether the power is good is unknown: this is not a Raspberry Pi")],
         };
     };
     let states = [
@@ -62,7 +62,7 @@ mod tests {
     #[test]
     fn a_pi_reports_its_power() {
         let tree = Tree::empty();
-        says(&power(&tree.computer(), None), "power", Fine, "unknown: this is no Raspberry Pi");
+        says(&power(&tree.computer(), None), "power", Fine, "unknown: this is not a Raspberry Pi");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
         says(&power(&tree.computer(), None), "power", Warning, "unknown");
         let file = "sys/devices/platform/soc/soc:firmware/get_throttled";

@@ -30,7 +30,7 @@ fn port(computer: &Computer, named: &str) -> Vec<Finding> {
             return vec![Finding::error(CHECK, found, missing(computer, named))];
         }
         Port::Other => {
-            let found = format!("TMC UART: {named} is no serial port");
+            let found = format!("TMC UART: {named} is not a serial port");
             return vec![Finding::error(CHECK, found, "another uart_pin in printer.cfg (pinion pins lists the ports)")];
         }
     };

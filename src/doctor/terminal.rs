@@ -92,7 +92,7 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
     };
     // Any user can make a link in /tmp to any file, and the remedies below are about the file.
     if !computer.is_terminal(&device, &about) {
-        let found = format!("{shown} leads to {}, which is no pseudo terminal", device.display());
+        let found = format!("{shown} leads to {}, which is not a pseudo terminal", device.display());
         return vec![Finding::error(CHECK, found, format!("sudo rm {} && {restart}", word(shown)))];
     }
     let leads = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));

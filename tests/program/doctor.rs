@@ -335,7 +335,7 @@ fn a_name_in_the_configuration_that_leads_out_of_dev_opens_nothing() {
     tree.link("dev/ttyX", "sda");
     for pin in ["serial/../sda", "serial/../../run/docker.sock", "ttyX", "ttyAMA0;reboot", "serial/by-id/x"] {
         let text = doctor(pin);
-        assert!(text.contains(&format!("  error    TMC UART: {pin} is no serial port\n")), "{text}");
+        assert!(text.contains(&format!("  error    TMC UART: {pin} is not a serial port\n")), "{text}");
         assert!(!text.contains("usermod") && !text.contains("docker.sock,"), "{text}");
     }
 }
@@ -351,7 +351,7 @@ fn a_link_that_leads_to_another_file_makes_klippy_s_user_no_member_of_its_group(
         tree.link("tmp/klipper_host_mcu", target);
         let text = tree.doctor();
         assert!(
-            text.contains(&format!("/tmp/klipper_host_mcu leads to {target}, which is no pseudo terminal\n")),
+            text.contains(&format!("/tmp/klipper_host_mcu leads to {target}, which is not a pseudo terminal\n")),
             "{text}"
         );
         assert!(text.contains("-> sudo rm /tmp/klipper_host_mcu && sudo systemctl restart pinion-mcu\n"), "{text}");

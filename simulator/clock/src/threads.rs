@@ -398,6 +398,6 @@ pub unsafe extern "C" fn pthread_join(thread: libc::pthread_t, result: *mut *mut
     while is_one() && living().contains(&thread) {
         wait(Wait::Address(end_of(thread)), NEVER);
     }
-    // What is left of its end needs no token.
+    // The rest of the thread's end needs no token.
     real!(fn pthread_join(thread: libc::pthread_t, result: *mut *mut c_void) -> libc::c_int)
 }

@@ -104,7 +104,7 @@ impl Klippy {
     fn output(&self, own: &Own) -> io::Result<String> {
         let folder = Folder::make(own, None, None).map_err(|trouble| io::Error::other(trouble.to_string()))?;
         let output = self.run(own, &folder);
-        // It is in /tmp. What is left of it does no harm.
+        // The folder is in /tmp. Files that stay there do no harm.
         let _ = fs::remove_dir_all(&folder.path);
         output
     }

@@ -5,7 +5,7 @@ ip link add vcan0 type vcan
 ip link set vcan0 up
 mkdir -p /etc/pinion
 printf 'board = "sim"\nlink = "can:vcan0,0123456789ab"\n' >/etc/pinion/toolhead.toml
-# Without the drop-in it says what is missing.
+# Without the drop-in the log names it.
 mark
 not systemctl start pinion-mcu@toolhead
 systemctl stop pinion-mcu@toolhead
