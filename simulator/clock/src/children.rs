@@ -103,8 +103,8 @@ fn forked(pid: libc::pid_t, word: usize, is_main: bool) {
             }
         }
         pid if pid > 0 => {
-            let child = Child { pid, looks: 0, word };
-            await_rest(&child);
+            let mut child = Child { pid, looks: 0, word };
+            await_rest(&mut child);
             CHILDREN.lock().unwrap_or_else(PoisonError::into_inner).push(child);
         }
         _ => {}
@@ -113,9 +113,10 @@ fn forked(pid: libc::pid_t, word: usize, is_main: bool) {
 
 /// Waits until a new child has ended, or waits for something. klippy may look at once whether it is done: the answer is the
 /// same however fast this computer is.
-fn await_rest(child: &Child) {
+fn await_rest(child: &mut Child) {
     let mut rests = 0;
-    for _ in 0..looks_max() {
+    while child.looks < looks_max() {
+        child.looks += 1;
         rests = if is_asleep(child.pid) { rests + 1 } else { 0 };
         if rests == RESTS || waits(child) || !lives(child.pid) {
             return;

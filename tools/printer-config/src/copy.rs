@@ -118,11 +118,12 @@ fn changed(
             comment_out(&mut lines, place.line);
             // In front of the SAVE_CONFIG block, if the section is in it: each line there has a mark.
             let is_saved = lines.get(place.line - 1).is_some_and(|line| line.starts_with("#*#"));
-            let at =
-                if is_saved { lines.iter().position(|line| line.starts_with("#*#")) } else { Some(place.line - 1) };
-            if let (true, Some(text), Some(line)) =
-                (is_first, &change.instead, at.and_then(|at| lines.get_mut(at - is_saved as usize)))
-            {
+            let at = match is_saved {
+                true => lines.iter().position(|line| line.starts_with("#*# <-")).and_then(|at| at.checked_sub(1)),
+                false => Some(place.line - 1),
+            };
+            let line = at.and_then(|at| lines.get_mut(at));
+            if let (true, Some(text), Some(line)) = (is_first, &change.instead, line) {
                 *line = format!("{text}\n{line}");
             }
             continue;

@@ -266,7 +266,7 @@ fn a_copy_without_a_section_has_none_of_its_lines() {
     assert!(again.section("a").is_none());
     assert_eq!(again.section("b").unwrap().text("z_offset"), Some("1.5"), "the block counts");
     // A section that only the block has.
-    fs::write(&path, format!("[c]\n\n{}", saved.replace("# # ", "# "))).unwrap();
+    fs::write(&path, format!("#*# old\n[c]\n\n{}", saved.replace("# # ", "# "))).unwrap();
     let config = Config::read(&path).unwrap();
     let another =
         Change { instead: Some("[d]\nx: 1".into()), section: "a".into(), left_out: true, ..Change::default() };
