@@ -98,7 +98,7 @@ build: system-packages-build
 	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-sim
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
-TEST_KERNEL = nice -n 5 '$(CARGO)' test --locked --test kernel
+TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
 # The drivers and mocks themselves, and what sends a hundred thousand frames: `make test-kernel` has them.
 DRIVERS = --flavour stock --skip selftest:: --skip can::a_node_that_floods --skip can::a_node_that_takes_and_gives
 
