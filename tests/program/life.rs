@@ -79,12 +79,20 @@ fn made_an_hour_ago(link: &Path) {
 
 #[test]
 fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_terminal() {
-    let mut killed = Pinion::simulated(&[]);
-    killed.signal(Signal::SIGKILL);
-    killed.end();
-    assert!(exists(&killed.link()), "it is left");
-    let (folder, _) = killed.into_folder();
-    let mut pinion = Pinion::simulated_in(folder);
+    // The terminal's number is free again, and another test's program may have it by now. It may name no link.
+    let is_served = |pinion: &Pinion| {
+        pinion
+            .until("its start", || ["serving on", "which Pinion serves"].iter().any(|end| pinion.log().contains(end)));
+        pinion.log().contains("serving on")
+    };
+    let mut tries = (0..10).map(|_| {
+        let mut killed = Pinion::simulated(&[]);
+        killed.signal(Signal::SIGKILL);
+        killed.end();
+        assert!(exists(&killed.link()), "it is left");
+        Pinion::start_in(killed.into_folder().0, &["run", "--board", "sim"])
+    });
+    let mut pinion = tries.find(is_served).expect("a number that is free");
     pinion.client().status().unwrap();
     pinion.signal(Signal::SIGKILL);
     pinion.end();
