@@ -238,6 +238,15 @@ fn a_change_that_does_not_fit_the_printer_fails() {
     }
 }
 
+/// Sections that a print of a file needs. A template is a program: that of HANG waits for itself.
+const MORE: &str = "[pause_resume]
+[gcode_macro HANG]
+gcode:
+  {% set lock = cycler.__init__.__globals__.__builtins__.__import__('threading').Lock() %}
+  {% set once = lock.acquire() %}
+  {% set twice = lock.acquire() %}
+";
+
 /// A print of a file on the built-in printer: whether it passed, and its report.
 fn printed(checkout: &Path, gcode: &str) -> Value {
     let home = tempfile::tempdir().unwrap();
@@ -245,7 +254,7 @@ fn printed(checkout: &Path, gcode: &str) -> Value {
     let _ = fs::set_permissions(home.path(), fs::Permissions::from_mode(0o777));
     let place = |name: &str| home.path().join(name);
     let config = Command::new(pinion_path()).args(["sim", "--print-config"]).output().unwrap().stdout;
-    fs::write(place("printer.cfg"), [config, b"[pause_resume]\n".to_vec()].concat()).unwrap();
+    fs::write(place("printer.cfg"), [config, MORE.into()].concat()).unwrap();
     fs::write(place("a.gcode"), gcode).unwrap();
     let mut command = Command::new(pinion_path());
     command.arg("sim").arg(place("printer.cfg")).arg("--print").arg(place("a.gcode")).arg("--json");
@@ -285,6 +294,7 @@ fn a_print_that_stops_says_at_which_line() {
         ("G28\nG1 X5000\n", 2, "Move out of range"),
         ("G28\nM112\n", 2, "Shutdown due to M112 command"),
         ("TEMPERATURE_WAIT SENSOR=extruder MINIMUM=100\n", 1, "nothing has moved for 60 min"),
+        ("HANG\n", 1, "it has not answered for 30 s of the printer: it waits at <template>, line"),
     ] {
         let report = printed(&checkout, gcode);
         let stopped = &report["stopped"];

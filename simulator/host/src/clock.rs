@@ -23,6 +23,7 @@ use pinion_firmware::trouble::Trouble;
 use pinion_model::SimBoard;
 use pinion_runtime::klippy::Checkout;
 
+use crate::hang::Hang;
 use crate::mcu::BoardMcu;
 
 /// The library in klippy.
@@ -53,8 +54,8 @@ const LOOK: Duration = Duration::from_millis(100);
 pub enum Stop {
     /// It has ended.
     Ended,
-    /// It computes without an end.
-    Computes,
+    /// It computes without an end, or waits for something outside of the clock.
+    Hangs(Option<Hang>),
     /// The program is asked to end.
     Asked,
 }
@@ -63,9 +64,9 @@ impl Display for Stop {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Stop::Ended => f.write_str("it has ended"),
-            Stop::Computes => {
-                let seconds = COMPUTE.as_secs();
-                write!(f, "it has computed for {seconds} s and waits for nothing: look for an endless loop")
+            Stop::Hangs(hang) => {
+                write!(f, "the printer has waited for it for {} s of the computer", COMPUTE.as_secs())?;
+                hang.iter().try_for_each(|hang| write!(f, ": {hang}"))
             }
             Stop::Asked => f.write_str("the trial was ended"),
         }
@@ -233,7 +234,7 @@ impl OneClock {
                     progress = (Instant::now(), self.now_ns);
                 } else if turns.is_multiple_of(1024) && progress.0.elapsed() > COMPUTE {
                     self.has_stopped = true;
-                    return Err(Stop::Computes);
+                    return Err(Stop::Hangs(None));
                 }
                 for mcu in &mut self.mcus {
                     mcu.take_in();
@@ -332,7 +333,7 @@ impl OneClock {
                         return Err(Stop::Asked);
                     }
                     if Instant::now() > until {
-                        return Err(Stop::Computes);
+                        return Err(Stop::Hangs(None));
                     }
                 }
                 Err(_) => return Err(Stop::Ended),

@@ -23,8 +23,11 @@ use serde_json::{Value, json};
 use pinion_firmware::trouble::Trouble;
 
 use crate::clock::{self, LIBRARY, Stop};
+use crate::hang::{self, Hang};
 use crate::time::Time;
 
+/// The file of klippy's output in its folder.
+const OUTPUT: &str = "klippy.out";
 /// The end of a message.
 const END: u8 = 3;
 /// Highest number of lines of klippy's output that are kept.
@@ -211,15 +214,28 @@ impl<W: Watch> Host<W> {
         let until = self.now() + span;
         while self.now() < until {
             let next = until.min(self.now() + WATCH);
-            self.time.sleep(next.saturating_sub(self.now()))?;
+            self.time.sleep(next.saturating_sub(self.now())).map_err(|stop| self.examined(stop))?;
             self.watch.look(self.time.now());
         }
         Ok(())
     }
 
+    /// Adds to a stop where klippy hangs.
+    fn examined(&mut self, stop: Stop) -> Stop {
+        match stop {
+            Stop::Hangs(None) => Stop::Hangs(Some(self.examine())),
+            stop => stop,
+        }
+    }
+
+    /// Finds out where a klippy hangs, and ends it.
+    fn examine(&mut self) -> Hang {
+        Hang::examine(&mut self.child, &self.socket.with_file_name(OUTPUT))
+    }
+
     /// Has klippy send its output.
     fn subscribe(&mut self) -> Result<(), Refused> {
-        self.call("gcode/subscribe_output", json!({ "response_template": {} }), ANSWER).map(drop)
+        self.ask("gcode/subscribe_output", json!({ "response_template": {} })).map(drop)
     }
 
     /// A call of the API.
@@ -293,7 +309,7 @@ impl<W: Watch> Host<W> {
                 return Err(Refused::Late);
             }
             let next = until.min(self.now() + WATCH);
-            let is_there = self.time.await_bytes(&self.api, next)?;
+            let is_there = self.time.await_bytes(&self.api, next).map_err(|stop| self.examined(stop))?;
             self.watch.look(self.time.now());
             if !is_there {
                 continue;
@@ -346,9 +362,21 @@ impl<W: Watch> Host<W> {
         }
     }
 
+    /// Asks klippy about itself. In one clock, a klippy that does not answer hangs, and is ended.
+    fn ask(&mut self, method: &str, params: Value) -> Result<Value, Refused> {
+        match self.call(method, params, ANSWER) {
+            Err(Refused::Late) if matches!(self.time, Time::One(_)) => {
+                let hang = self.examine();
+                let seconds = ANSWER.as_secs();
+                Err(Refused::Gone(format!("it has not answered for {seconds} s of the printer: {hang}")))
+            }
+            answer => answer,
+        }
+    }
+
     /// klippy's state and its words about it.
     pub fn state(&mut self) -> Result<(String, String), Refused> {
-        let info = self.call("info", json!({}), ANSWER)?;
+        let info = self.ask("info", json!({}))?;
         let text = |key: &str| info[key].as_str().unwrap_or_default().to_owned();
         Ok((text("state"), text("state_message")))
     }
@@ -357,13 +385,13 @@ impl<W: Watch> Host<W> {
     pub fn query(&mut self, objects: &[&str]) -> Result<Value, Refused> {
         let objects: serde_json::Map<String, Value> =
             objects.iter().map(|name| ((*name).to_owned(), Value::Null)).collect();
-        let answer = self.call("objects/query", json!({ "objects": objects }), ANSWER)?;
+        let answer = self.ask("objects/query", json!({ "objects": objects }))?;
         Ok(answer["status"].clone())
     }
 
     /// All objects of klippy.
     pub fn objects(&mut self) -> Result<Vec<String>, Refused> {
-        Ok(texts(&self.call("objects/list", json!({}), ANSWER)?["objects"]))
+        Ok(texts(&self.ask("objects/list", json!({}))?["objects"]))
     }
 
     /// The names of klippy's heaters.
@@ -428,7 +456,7 @@ impl Started {
         }
         let socket = folder.join("klippy.sock");
         let _ = std::fs::remove_file(&socket);
-        let output = File::create(folder.join("klippy.out")).map_err(|error| failed(error.to_string()))?;
+        let output = File::create(folder.join(OUTPUT)).map_err(|error| failed(error.to_string()))?;
         let turns = match time {
             Time::Real(..) => None,
             // The library is for 64 bits.
@@ -446,7 +474,7 @@ impl Started {
                 command.arg("env").arg(format!("LD_PRELOAD=/proc/self/fd/{}", file.as_raw_fd()));
                 command.arg(format!("{}={}", clock::WORD, clock::word(&theirs, folder)));
                 // The same order of names in each run; one thread for numpy.
-                command.args(["PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
+                command.args([hang::PRINTS, "PYTHONHASHSEED=0", "OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]);
                 Some((ours, theirs, file))
             }
         };
@@ -484,7 +512,7 @@ fn await_api(
     if let (Time::One(clock), Some(turns)) = (&mut *time, turns) {
         match clock.await_player(turns) {
             Ok(()) => {}
-            Err(Stop::Computes) => return Err(NoStart::Alone),
+            Err(Stop::Hangs(_)) => return Err(NoStart::Alone),
             Err(_) => return Err(no_start(folder, true).into()),
         }
     }
@@ -528,8 +556,8 @@ fn no_start(folder: &Path, ended: bool) -> Trouble {
         let cause = format!("klippy opens no API within {} s", START.as_secs());
         return Trouble::new(cause).remedy(format!("read {}", folder.join("klippy.log").display()));
     }
-    let (file, last) = match (last_of("klippy.out"), last_of("klippy.log")) {
-        (Some(last), _) => ("klippy.out", last),
+    let (file, last) = match (last_of(OUTPUT), last_of("klippy.log")) {
+        (Some(last), _) => (OUTPUT, last),
         (None, last) => ("klippy.log", last.unwrap_or_else(|| "it says nothing".into())),
     };
     let file = folder.join(file);

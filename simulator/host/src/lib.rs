@@ -8,11 +8,13 @@
 #![forbid(unsafe_code)]
 
 mod clock;
+mod hang;
 mod klippy;
 mod mcu;
 mod time;
 mod workers;
 
 pub use clock::{MCUS, OneClock, Stop, forms, start};
+pub use hang::Hang;
 pub use klippy::{Host, Launch, NoStart, Refused, Running, Watch};
 pub use time::Time;

@@ -196,7 +196,8 @@ impl Print<'_> {
         let phases = Phase::ALL.map(|phase| {
             let starts = std::iter::once(0.0).chain(self.samples.iter().map(|sample| sample.at_s));
             let of_phase = self.samples.iter().zip(starts).filter(|(sample, _)| sample.phase == phase);
-            (phase, of_phase.map(|(sample, from)| sample.at_s - from).sum())
+            // The sum of nothing is -0.0.
+            (phase, of_phase.map(|(sample, from)| sample.at_s - from).sum::<f64>() + 0.0)
         });
         Printed {
             file: self.file.name(),

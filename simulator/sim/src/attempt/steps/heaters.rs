@@ -64,7 +64,7 @@ pub(super) fn cooled(trial: &mut Trial<'_>) -> Seen {
     let objects: Vec<&str> = targets.iter().map(|(name, _)| name.as_str()).collect();
     let read = |trial: &mut Trial<'_>| match trial.host.query(&objects) {
         Ok(status) => Ok(objects.iter().map(|name| celsius(&status, name)).collect::<Vec<f64>>()),
-        Err(refused) => Err(trial.failed(format!("klippy does not answer: {refused:?}"), None)),
+        Err(refused) => Err(trial.failed(format!("klippy does not answer: {refused}"), None)),
     };
     let hot = read(trial)?;
     trial.gcode("TURN_OFF_HEATERS", LONG)?;
@@ -102,7 +102,7 @@ fn heat(trial: &mut Trial<'_>, targets: &[(String, f64)]) -> Result<(), Outcome>
     loop {
         let status = match trial.host.query(&objects) {
             Ok(status) => status,
-            Err(refused) => return Err(trial.failed(format!("klippy does not answer: {refused:?}"), None)),
+            Err(refused) => return Err(trial.failed(format!("klippy does not answer: {refused}"), None)),
         };
         let cold = targets.iter().find(|(name, target)| (celsius(&status, name) - target).abs() > NEAR_K);
         let Some((name, target)) = cold else { return Ok(()) };

@@ -138,6 +138,6 @@ fn send(trial: &mut Trial<'_>, block: &str) -> Result<(), Outcome> {
             let words = trial.why(words);
             Err(trial.failed(words, None))
         }
-        Err(refused) => Err(trial.failed(format!("the print stopped: {refused:?}"), None)),
+        Err(refused) => Err(trial.failed(format!("the print stopped: {refused}"), None)),
     }
 }

@@ -19,7 +19,7 @@ pub(super) fn ready(trial: &mut Trial<'_>) -> Seen {
     }
     match trial.host.objects() {
         Ok(objects) => trial.objects = objects,
-        Err(refused) => return Err(trial.failed(format!("klippy names no objects: {refused:?}"), None)),
+        Err(refused) => return Err(trial.failed(format!("klippy names no objects: {refused}"), None)),
     }
     let count = trial.own.mcus.len();
     Ok(format!("klippy is ready, with {count} MCU{}", if count == 1 { "" } else { "s" }))
