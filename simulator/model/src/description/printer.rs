@@ -130,6 +130,17 @@ impl<'a> Printer<'a> {
         rails.into_iter().copied().find(|rail| of_rail(rail)).and_then(|rail| self.axis(rail))
     }
 
+    /// Whether an axis is a further motor on the belt of another one: a CoreXY with four motors has `x1` and `y1`.
+    pub(crate) fn is_second_on_belt(&self, axis: &str) -> bool {
+        !self.belt(axis).is_empty() && self.first_motor(axis).is_some()
+    }
+
+    /// The belt of an axis, or of the axis whose belt it shares.
+    pub(crate) fn belt(&self, axis: &str) -> &'static [(&'static str, f64)] {
+        let first = self.first_motor(axis).map_or(axis, |first| &first.name);
+        self.kinematics().belt(first)
+    }
+
     /// The heaters of the hot ends: `extruder`, `extruder1` and so on.
     pub(crate) fn hot_ends(&self) -> impl Iterator<Item = &'a HeaterConfig> {
         in_a_row("extruder", |name| self.heaters.iter().find(|heater| heater.name == name))
@@ -148,10 +159,9 @@ impl<'a> Printer<'a> {
 
     /// Whether the motor of an axis moves several rails, or other motors move its rail.
     pub(crate) fn shares_belt(&self, axis: &str) -> bool {
-        let kinematics = self.kinematics();
         let others = self.axes.iter().filter(|other| other.name != axis);
-        let mut belts = others.flat_map(|other| kinematics.belt(&other.name));
-        !kinematics.belt(axis).is_empty()
+        let mut belts = others.flat_map(|other| self.belt(&other.name));
+        !self.belt(axis).is_empty()
             || belts.any(|(rail, _)| *rail == axis)
             || self.axis(axis).is_some_and(|axis| !axis.carriages.is_empty())
     }

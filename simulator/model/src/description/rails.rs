@@ -66,12 +66,13 @@ impl<'a> Gears<'a> {
     ///
     /// A motor moves a carriage that is not there, or the motors leave a carriage loose.
     pub(crate) fn of(printer: &Printer<'a>) -> Result<Gears<'a>, Trouble> {
-        let own = printer.axes.iter().filter(|axis| axis.carriages.is_empty()).map(RailConfig::of);
+        let has_rail = |axis: &&AxisConfig| axis.carriages.is_empty() && !printer.is_second_on_belt(&axis.name);
+        let own = printer.axes.iter().filter(has_rail).map(RailConfig::of);
         let rails: Vec<_> = own.chain(printer.carriages.iter().map(RailConfig::of_carriage)).collect();
         let mut belts = Vec::new();
         for axis in printer.axes {
             let mut belt = vec![0.0; rails.len()];
-            let of_kinematics = printer.kinematics().belt(&axis.name);
+            let of_kinematics = printer.belt(&axis.name);
             let carriages: Vec<(&str, f64)> = match &axis.carriages {
                 own if !own.is_empty() => own.iter().map(|(name, way)| (name.as_str(), *way)).collect(),
                 _ if !of_kinematics.is_empty() => of_kinematics.to_vec(),

@@ -10,7 +10,7 @@ use pinion_printer_config::{Config, Limit, Section, Trouble};
 use super::known::{MAKES_PROBE, is_numbered, lacks_module, motor_of, near};
 use super::sensors::is_known;
 
-/// The probes of plugins.
+/// The probes of plugins. Others are known by their offsets.
 const PROBES: [&str; 7] = ["beacon", "cartographer", "scanner", "idm", "probe_eddy_ng", "tool_probe", "btt_eddy"];
 /// The steppers of klippy's kinematics, without their numbers.
 const STEPPERS: [&str; 10] = ["x", "y", "z", "a", "b", "c", "left", "right", "bed", "arm"];
@@ -64,7 +64,10 @@ impl LeftOut {
         let is_without_pin = |section: &Section| section.text("pin").is_none() && section.name == "probe";
         let makes_probe = |kind: &str| kind == "probe" || MAKES_PROBE.contains(&kind);
         let has_own_probe = all.iter().any(|section| makes_probe(section.kind()) && !is_without_pin(section));
-        let probe = all.iter().find(|section| is_plugins(section) && PROBES.contains(&section.kind()));
+        let of_plugins =
+            |is_it: &dyn Fn(&Section) -> bool| all.iter().find(|section| is_plugins(section) && is_it(section));
+        let has_offset = |section: &Section| ["x_offset", "y_offset"].iter().any(|key| section.text(key).is_some());
+        let probe = of_plugins(&|section| PROBES.contains(&section.kind())).or_else(|| of_plugins(&has_offset));
         let probe = probe.filter(|_| !has_own_probe);
         let has_plugin = all.iter().any(is_plugins);
         let has_known_sensor =
@@ -104,7 +107,9 @@ impl LeftOut {
                 let saved = saved.map(|saved| saved.number(key, Limit::Any)).transpose()?.flatten();
                 Ok::<f64, Trouble>(own.or(saved).unwrap_or(usual))
             };
-            let offsets_mm = [offset("x_offset", 0.0)?, offset("y_offset", 0.0)?, offset("z_offset", Z_OFFSET_MM)?];
+            // Some measure how far they are from the bed, and have no height of their own.
+            let z_mm = Some(offset("z_offset", Z_OFFSET_MM)?).filter(|mm| *mm > 0.0).unwrap_or(Z_OFFSET_MM);
+            let offsets_mm = [offset("x_offset", 0.0)?, offset("y_offset", 0.0)?, z_mm];
             Ok::<StandIn, Trouble>(StandIn { section: section.name.clone(), offsets_mm })
         };
         Ok(LeftOut { sections, stand_in: probe.map(stand_in).transpose()?, files: false })
@@ -192,6 +197,8 @@ mod tests {
             assert_eq!((stand_in.section.as_str(), stand_in.offsets_mm), (kind, [0.0, 20.0, 1.2]));
             assert_eq!(stand_in.text(), "[probe]\npin: pinion_stand_in\nx_offset: 0\ny_offset: 20\nz_offset: 1.2");
         }
+        let (_, stand_in) = left_out("[shaketune]\n[BDsensor]\nz_offset: 0\ny_offset: 25\n", None);
+        assert_eq!(stand_in.unwrap().offsets_mm, [0.0, 25.0, Z_OFFSET_MM], "one that is not in the list");
         let (sections, stand_in) = left_out("[beacon]\nserial: x\n[probe]\npin: PA1\nz_offset: 1\n", None);
         assert_eq!((sections, stand_in.is_none()), (vec!["beacon".to_owned()], true), "it has one");
     }

@@ -130,6 +130,25 @@ fn belts_move_the_head_as_klippys_kinematics_say() {
 }
 
 #[test]
+fn four_motors_of_a_corexy_drive_two_belts() {
+    let text = ["x", "y", "z", "x1", "y1"].map(rail).concat();
+    let mut bench = printer(&format!("[kinematics]\nkind = \"corexy\"\n{text}"));
+    // To the far end of both belts, which is farther than any rail.
+    for _ in 0..10 {
+        ["x", "x1"].into_iter().for_each(|motor| go(&mut bench, motor, 20.0));
+    }
+    assert_at(&bench, [150.0, 150.0, 50.0]);
+    for _ in 0..10 {
+        ["y", "y1"].into_iter().for_each(|motor| go(&mut bench, motor, -10.0));
+    }
+    assert_at(&bench, [100.0, 200.0, 50.0]);
+    assert!(bench.probe.axes().all(|axis| axis.lost_steps == 0));
+    // Without its first motor, the second one goes no farther than a belt gives.
+    go(&mut bench, "y1", 10.0);
+    assert!(bench.axis("y1").lost_steps > 0);
+}
+
+#[test]
 fn the_second_carriage_of_a_hybrid_corexy_has_a_belt_of_its_own() {
     let text = ["x", "y", "z", "dual_carriage"].map(rail).concat();
     let mut bench = printer(&format!("[kinematics]\nkind = \"hybrid_corexy\"\n{text}"));
