@@ -108,7 +108,10 @@ impl LeftOut {
                 Ok::<f64, Trouble>(own.or(saved).unwrap_or(usual))
             };
             // Some measure how far they are from the bed, and have no height of their own.
-            let z_mm = Some(offset("z_offset", Z_OFFSET_MM)?).filter(|mm| *mm > 0.0).unwrap_or(Z_OFFSET_MM);
+            let own_mm = Some(offset("z_offset", 0.0)?).filter(|mm| *mm > 0.0);
+            // Such a probe may go from point to point near the bed.
+            let low_mm = all.iter().filter_map(|section| section.text("horizontal_move_z")?.trim().parse::<f64>().ok());
+            let z_mm = own_mm.unwrap_or_else(|| low_mm.map(|mm| mm / 4.0).fold(Z_OFFSET_MM, f64::min));
             let offsets_mm = [offset("x_offset", 0.0)?, offset("y_offset", 0.0)?, z_mm];
             Ok::<StandIn, Trouble>(StandIn { section: section.name.clone(), offsets_mm })
         };
@@ -199,6 +202,8 @@ mod tests {
         }
         let (_, stand_in) = left_out("[shaketune]\n[BDsensor]\nz_offset: 0\ny_offset: 25\n", None);
         assert_eq!(stand_in.unwrap().offsets_mm, [0.0, 25.0, Z_OFFSET_MM], "one that is not in the list");
+        let (_, stand_in) = left_out("[beacon]\ny_offset: 25\n[bed_mesh]\nhorizontal_move_z: 1\n", None);
+        assert_eq!(stand_in.unwrap().offsets_mm, [0.0, 25.0, 0.25], "it goes near the bed");
         let (sections, stand_in) = left_out("[beacon]\nserial: x\n[probe]\npin: PA1\nz_offset: 1\n", None);
         assert_eq!((sections, stand_in.is_none()), (vec!["beacon".to_owned()], true), "it has one");
     }
