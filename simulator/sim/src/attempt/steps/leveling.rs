@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Leveling with a probe, and the calibration of the probe.
 
+use std::time::Duration;
+
 use pinion_printer_config::Limit;
 
 use super::{Seen, skipped};
 use crate::attempt::trial::{LONG, Trial, travel};
 
+/// How long a leveling may take. A mesh of 20 by 20 points with three samples each needs more than an hour.
+const LEVELING: Duration = Duration::from_secs(4 * 3600);
 /// How level a gantry or bed has to be.
 const LEVEL_MM: f64 = 0.1;
 
@@ -38,8 +42,9 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
     }
     let before = trial.lost();
     for (place, command, moves) in &found {
-        for script in ["G28", command, "M400"] {
-            trial.gcode(script, LONG).map_err(|outcome| outcome.at(place))?;
+        trial.gcode("G28", LONG).map_err(|outcome| outcome.at(place))?;
+        for script in with_probe(trial, &[command, "M400"]) {
+            trial.gcode(script, LEVELING).map_err(|outcome| outcome.at(place))?;
         }
         if let Some((apart, name)) =
             apart(trial).filter(|(apart, _)| *apart > level_mm(trial) && *moves == Moves::Motors)
@@ -53,7 +58,21 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
     Ok(commands.join(", "))
 }
 
-/// The same with the tolerance of the user. The motors are farther apart than the points.
+/// Commands that need the probe of a dock: its macros take it up first and put it back. Those of commands that do so
+/// themselves leave a probe that is locked where it is.
+fn with_probe<'a>(trial: &Trial<'_>, commands: &[&'a str]) -> Vec<&'a str> {
+    const TAKE_UP: &str = "ATTACH_PROBE_LOCK";
+    const PUT_BACK: &str = "DOCK_PROBE_UNLOCK";
+    let has_macro = |name: &str| {
+        let mut macros = trial.config().of_kind("gcode_macro");
+        macros.any(|section| section.own_name().is_some_and(|own| own.eq_ignore_ascii_case(name)))
+    };
+    let needs = [TAKE_UP, PUT_BACK].into_iter().all(has_macro);
+    let [before, behind] = [TAKE_UP, PUT_BACK].map(|name| needs.then_some(name));
+    before.into_iter().chain(commands.iter().copied()).chain(behind).collect()
+}
+
+/// How far apart they may be: as far as the user tolerates. The motors are farther apart than the points.
 fn level_mm(trial: &Trial<'_>) -> f64 {
     let sections = ["z_tilt", "z_tilt_ng", "quad_gantry_level"].map(|name| trial.config().section(name));
     let tolerances = sections.into_iter().flatten();
@@ -86,7 +105,8 @@ pub(super) fn probed(trial: &mut Trial<'_>) -> Seen {
     // A probe that is put below the nozzle by hand needs more room.
     let z = 10.0 + z_offset_mm(trial).max(0.0);
     let middle = format!("G90\nG1 Z{z:.2} F600\nG1 X{x:.2} Y{y:.2} F6000");
-    for command in ["G28", &middle, "PROBE_CALIBRATE", "ABORT"] {
+    trial.gcode("G28", LONG)?;
+    for command in with_probe(trial, &[&middle, "PROBE_CALIBRATE", "ABORT"]) {
         trial.gcode(command, LONG)?;
     }
     trial.lost_none_since(&before)?;
