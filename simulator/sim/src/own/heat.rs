@@ -40,6 +40,13 @@ fn has_sensor(kind: &str) -> bool {
         .contains(&kind)
 }
 
+/// The first sensor that a combined sensor reads: the name of its section.
+fn first_sensor(section: &Section) -> Option<&str> {
+    let is_combined = section.text("sensor_type") == Some("temperature_combined");
+    let list = section.text("sensor_list").filter(|_| is_combined)?;
+    list.split([',', '\n']).map(str::trim).find(|name| !name.is_empty())
+}
+
 impl Translator<'_> {
     pub(super) fn heat(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections().iter().filter(|section| has_sensor(section.kind())) {
@@ -59,11 +66,19 @@ impl Translator<'_> {
                 None => Ok(()),
             };
         };
+        let heats = |of: &Section| first_sensor(of).and_then(|sensor| self.config.section(sensor)).is_some();
+        if heats(section) && section.text("heater_pin").is_some() {
+            // What its first sensor measures has the heater.
+            return Ok(());
+        }
         let klippys = section.own_name().unwrap_or(&section.name).to_owned();
+        // The section with the power that heats this sensor.
+        let mut others = self.config.sections().iter().filter(|other| other.text("heater_pin").is_some());
+        let powered = others.find(|other| first_sensor(other) == Some(&section.name)).unwrap_or(section);
         let name = self.out.name("heater", &klippys);
         // A pin of another chip drives nothing here, and klippy needs one.
-        let nothing = section.text("heater_pin").map(|_| self.out.name("nothing", &format!("nothing_{name}")));
-        let pin = self.take(section, "heater_pin")?.or(nothing);
+        let nothing = powered.text("heater_pin").map(|_| self.out.name("nothing", &format!("nothing_{name}")));
+        let pin = self.take(powered, "heater_pin")?.or(nothing);
         let min = section.number("min_temp", Limit::Any)?.unwrap_or(0.0);
         let max = section.number("max_temp", Limit::Any)?.unwrap_or(100.0);
         if max > UNREAL_CELSIUS {
@@ -80,12 +95,12 @@ impl Translator<'_> {
         }
         entry = match &pin {
             Some(pin) => {
-                let rate = self.kelvin_per_second(section)?;
+                let rate = self.kelvin_per_second(powered)?;
                 let watts = rate * J_PER_K;
                 // A heater that never gets all of its power has more of it.
-                let share = section.number("max_power", Limit::Above(0.0))?.unwrap_or(1.0).min(1.0);
-                let real_max = max.min(REAL_MAX_CELSIUS[usize::from(section.kind() != "heater_bed")]);
-                let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, real_max)?);
+                let share = powered.number("max_power", Limit::Above(0.0))?.unwrap_or(1.0).min(1.0);
+                let real_max = max.min(REAL_MAX_CELSIUS[usize::from(powered.kind() != "heater_bed")]);
+                let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(powered, real_max)?);
                 entry
                     .set("pin", pin.as_str())
                     .set("heater_watts", watts / share)

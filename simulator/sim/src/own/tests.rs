@@ -293,6 +293,20 @@ fn a_probe_as_endstop_leaves_position_endstop_without_a_meaning() {
 }
 
 #[test]
+fn a_heater_with_a_combined_sensor_heats_what_its_first_sensor_measures() {
+    let dryer = "[temperature_sensor box]\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: PA4\n[heater_generic dryer]\n\
+                 heater_pin: PD9\nmax_power: 0.5\nsensor_type: temperature_combined\nsensor_list: temperature_sensor box,\n  \
+                 temperature_host a\ncombination_method: mean\nmaximum_deviation: 50\ncontrol: watermark\n\
+                 min_temp: 0\nmax_temp: 90\n[extruder]";
+    let description = translated(&PRINTER.replace("[extruder]", dryer)).unwrap().description;
+    let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
+    let found: Vec<_> = heaters.filter(|heater| heater.get("pin") == Some(&Value::from("PD9"))).collect();
+    let [heater] = found[..] else { panic!("{description}") };
+    assert_eq!(heater["name"].as_str(), Some("box"));
+    assert!(heater["heater_watts"].as_float().unwrap() > 0.0);
+}
+
+#[test]
 fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
     let klicky =
         "[gcode_macro _User_Variables]\nvariable_docklocation_x: -21\nvariable_docklocation_y: 370.5 \ngcode:\n";
