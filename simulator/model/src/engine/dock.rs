@@ -32,11 +32,16 @@ impl Dock {
         self.has_probe.load(Ordering::Relaxed)
     }
 
+    /// Whether the head is there.
+    pub(crate) fn is_there(&self) -> bool {
+        self.is_there.load(Ordering::Relaxed)
+    }
+
     /// The head has moved.
     pub(crate) fn passed(&self) {
         let [x_mm, y_mm] = self.place_mm;
         let far_mm = (self.x.position_mm() - x_mm).hypot(self.y.position_mm() - y_mm);
-        let was_there = self.is_there.load(Ordering::Relaxed);
+        let was_there = self.is_there();
         if !was_there && far_mm <= NEAR_MM {
             self.is_there.store(true, Ordering::Relaxed);
             self.has_probe.fetch_xor(true, Ordering::Relaxed);

@@ -74,8 +74,12 @@ impl Part for ProbeConfig {
 
 /// A switch at `tip`, which is the point of contact relative to the nozzle.
 fn switch(bed: Bed, tip: [f64; 3], dock: Option<Arc<Dock>>) -> impl Wire {
-    let is_docked = move || dock.as_ref().is_some_and(|dock| dock.has_probe());
-    input("probe".into(), move |_| is_docked() || bed.clearance_mm(tip) <= 0.0)
+    input("probe".into(), move |_| match &dock {
+        Some(dock) if dock.has_probe() => true,
+        // The dock is beside the bed.
+        Some(dock) if dock.is_there() => false,
+        _ => bed.clearance_mm(tip) <= 0.0,
+    })
 }
 
 #[cfg(test)]
@@ -130,5 +134,26 @@ mod tests {
         };
         let places = [65.0, 70.0, 65.0, 60.0, 71.0, 69.0, 75.0, 60.0];
         assert_eq!(places.map(&mut go_to), [true, false, false, false, true, true, true, false]);
+    }
+
+    #[test]
+    fn in_its_dock_it_touches_no_bed() {
+        let printer = DefaultPrinter::read();
+        let [x, y, z] = [0, 1, 2].map(|place| Arc::new(Axis::new(&printer.axes[place])));
+        let bed = Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z));
+        // The nozzle is 12 mm above the bed, and the probe 20 mm below it.
+        let dock = Arc::new(Dock::new(x.rail().clone(), y.rail().clone(), [60.0, 45.0]));
+        let probe = switch(bed, [0.0, 0.0, -20.0], Some(dock.clone()));
+        let now = Clock::from_ticks(0);
+        assert!(probe.sense(false, now), "it is in the dock");
+        dock.passed();
+        assert!(!probe.sense(false, now), "at the head, in the dock");
+        x.set_enabled(true);
+        x.passes(dock);
+        x.set_forward(true);
+        while x.position_mm() < 64.0 {
+            x.edge(true, now);
+        }
+        assert!(probe.sense(false, now), "over the bed");
     }
 }

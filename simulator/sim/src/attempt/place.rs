@@ -70,7 +70,7 @@ pub(crate) fn place_of(config: &Config, message: &str) -> Option<Place> {
             return Some(found.place_of("endstop_pin").clone());
         }
         if lower.contains("probe") {
-            let kinds = ["probe", "bltouch", "smart_effector"];
+            let kinds = ["probe", "bltouch", "smart_effector", "dockable_probe"];
             return kinds.iter().find_map(|kind| config.section(kind)).map(|section| section.place.clone());
         }
     }

@@ -49,7 +49,7 @@ impl<'a> Role<'a> {
             ("static_digital_output", "pins") => OUTPUT,
             ("led", "red_pin" | "green_pin" | "blue_pin" | "white_pin") => OUTPUT,
             ("neopixel", "pin") | ("dotstar", "data_pin" | "clock_pin") => PLAIN,
-            ("probe" | "smart_effector", "pin") | ("bltouch", "sensor_pin") => INPUT,
+            ("probe" | "smart_effector" | "dockable_probe", "pin") | ("bltouch", "sensor_pin") => INPUT,
             ("bltouch", "control_pin") => OUTPUT,
             ("filament_switch_sensor" | "filament_motion_sensor", "switch_pin") => INPUT,
             ("gcode_button", "pin") if is_analog("analog_range") => PLAIN.shared("adc button"),

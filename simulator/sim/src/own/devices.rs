@@ -76,7 +76,7 @@ impl Translator<'_> {
         match section.kind() {
             _ if self.left_out.stand_in.is_some() && section.kind() == "probe" => Ok(()),
             "probe" if is_left_over(self.config, section) => Ok(()),
-            "probe" | "smart_effector" => self.probe(section),
+            "probe" | "smart_effector" | "dockable_probe" => self.probe(section),
             "bltouch" => self.bltouch(section),
             "probe_eddy_current" => self.eddy(section),
             "load_cell" | "load_cell_probe" => self.load_cell(section),
@@ -121,17 +121,28 @@ impl Translator<'_> {
         }
         let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
         let mut part = Translator::offsets(Entry::default().set("kind", "probe").set("pin", pin), section)?;
-        // The macros of Klicky, which take the probe up and put it down.
-        let macros = || self.config.of_kind("gcode_macro");
-        let place = |axis: &str| {
-            let key = format!("variable_docklocation_{axis}");
-            macros().find_map(|section| section.text(&key)?.trim().parse::<f64>().ok())
-        };
-        if let (Some(x), Some(y)) = (place("x"), place("y")) {
-            part = part.set("dock_mm", vec![x, y]);
+        if let Some(dock_mm) = self.dock_mm(section) {
+            part = part.numbers("dock_mm", dock_mm);
         }
         self.out.add("part", part);
         Ok(())
+    }
+
+    /// Where the nozzle is when it takes a probe up and puts it back: of Kalico's dockable probe, or of the macros of
+    /// Klicky or Euclid.
+    fn dock_mm(&self, probe: &Section) -> Option<[f64; 2]> {
+        let of_macros = |key: &str| self.config.of_kind("gcode_macro").find_map(|section| section.text(key));
+        let number = |text: &str| text.trim().parse::<f64>().ok();
+        let pair = |text: &str| {
+            let mut numbers = text.trim().trim_matches(['[', ']', '(', ')']).split(',').map(number);
+            Some([numbers.next()??, numbers.next()??])
+        };
+        let klicky = || {
+            let place = |axis: &str| of_macros(&format!("variable_docklocation_{axis}")).and_then(number);
+            Some([place("x")?, place("y")?])
+        };
+        let own = probe.text("dock_position").and_then(pair);
+        own.or_else(klicky).or_else(|| of_macros("variable_position_dock").and_then(pair))
     }
 
     fn bltouch(&mut self, section: &Section) -> Result<(), Trouble> {

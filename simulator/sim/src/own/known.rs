@@ -17,8 +17,7 @@ pub(crate) enum Kind {
 }
 
 /// Hardware without a simulation.
-const NOT_SIMULATED: &[&str] =
-    &["ads131m0x", "ads1x1x", "belay", "dockable_probe", "mcp4728", "palette2", "replicape", "trad_rack"];
+const NOT_SIMULATED: &[&str] = &["ads131m0x", "ads1x1x", "belay", "mcp4728", "palette2", "replicape", "trad_rack"];
 
 /// All others.
 const KNOWN: &str = include_str!("sections.txt");
@@ -94,7 +93,8 @@ pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
 }
 
 /// klippy's sections that make the probe, beside `[probe]`.
-pub(super) const MAKES_PROBE: [&str; 4] = ["bltouch", "load_cell_probe", "probe_eddy_current", "smart_effector"];
+pub(super) const MAKES_PROBE: [&str; 5] =
+    ["bltouch", "dockable_probe", "load_cell_probe", "probe_eddy_current", "smart_effector"];
 
 /// Whether klippy loads nothing for this `[probe]`, because a section before it has made the probe. SAVE_CONFIG leaves such
 /// sections behind. A section of somebody's module may have made it.

@@ -319,6 +319,12 @@ fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
     };
     let probe = of(&text("[extruder]"), "part", "kind", "probe");
     assert_eq!(probe["dock_mm"].as_array().unwrap(), &[Value::from(-21.0), Value::from(370.5)]);
+    let euclid = "[gcode_macro EuclidProbe]\nvariable_position_dock: [ 52, 355 ] # dock\ngcode:\n[probe]";
+    let kalicos = "[dockable_probe]\ndock_position: 295, 350.5, 4";
+    for (text, [x, y]) in [(euclid, [52.0, 355.0]), (kalicos, [295.0, 350.5])] {
+        let probe = of(&PRINTER.replace("[probe]", text), "part", "kind", "probe");
+        assert_eq!(probe["dock_mm"].as_array().unwrap(), &[Value::from(x), Value::from(y)], "{text}");
+    }
     let watts = |more: &str| of(&text(more), "heater", "name", "extruder")["heater_watts"].as_float().unwrap();
     assert!((watts("[extruder]\nmax_power: 0.4") * 0.4 - watts("[extruder]")).abs() < 1e-9);
     let room = |text: &str| of(text, "axis", "name", "x")["overtravel_mm"].as_float().unwrap();
