@@ -13,7 +13,7 @@
 
 use std::collections::BTreeSet;
 
-use super::side::MARK;
+use super::edit::MARK;
 use pinion_system::board::Bus;
 use pinion_system::uses::boot::{ConfigTxt, Env};
 

@@ -25,6 +25,7 @@ use pinion_system::uses::{Resource, Source, Uses};
 mod boot;
 mod catalog;
 mod check;
+mod edit;
 mod list;
 mod measure;
 mod missing;
@@ -35,18 +36,17 @@ mod plan;
 mod printer;
 mod probe;
 mod report;
-mod side;
 mod undo;
 mod work;
 
 use catalog::{Catalog, Device, Wiring};
+use edit::{Edit, Editor};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};
 use place::Search;
 pub(super) use place::Wire;
 use printer::Target;
 use report::Report;
-use side::{Edit, Side};
 use work::Work;
 
 /// The buses that a user may choose between.
@@ -381,7 +381,7 @@ fn command(args: &AddArgs, undo: bool) -> String {
 fn make(
     args: &AddArgs,
     moonraker: Option<&str>,
-    side: &Side,
+    editor: &Editor,
     edits: &[Edit],
     question: &str,
     report: &mut Report,
@@ -406,13 +406,13 @@ fn make(
     if args.dry_run || edits.is_empty() {
         return Ok(());
     }
-    if side.computer.is_this() && side.is_root_s() && !geteuid().is_root() {
+    if editor.computer.is_this() && editor.is_root_s() && !geteuid().is_root() {
         return Err(format!("these files are root's: {}", command(args, args.undo)));
     }
     if !question.is_empty() {
-        ask(args, side.computer, moonraker, report, question)?;
+        ask(args, editor.computer, moonraker, report, question)?;
     }
-    for told in side.make(edits)? {
+    for told in editor.make(edits)? {
         report.line(told);
     }
     report.changed.extend(edits.iter().map(|edit| edit.file.display().to_string()));

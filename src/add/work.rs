@@ -8,10 +8,10 @@ use std::process::{Command, ExitStatus};
 use serde_json::json;
 
 use super::catalog::{Catalog, Device, Wiring, is_line};
+use super::edit::Editor;
 use super::place::{Search, Wire};
 use super::printer::Target;
 use super::report::Report;
-use super::side::Side;
 use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
 use pinion_system::Computer;
 use pinion_system::board::{Board, Slot};
@@ -88,7 +88,7 @@ impl Work<'_> {
             make(
                 self.args,
                 moonraker.as_deref(),
-                &Side::new(self.computer, None),
+                &Editor::new(self.computer, None),
                 &boot,
                 "Change these files?",
                 self.report,
@@ -128,7 +128,7 @@ impl Work<'_> {
         match target {
             Ok(target) => {
                 let own = target.file(&self.device.file(self.name()));
-                Side::new(self.computer, Some(target.owner)).probe(target.files().chain([target.path.clone(), own]))
+                Editor::new(self.computer, Some(target.owner)).probe(target.files().chain([target.path.clone(), own]))
             }
             Err(_) if configs(self.computer).is_empty() => Ok(()),
             Err(why) => Err(why.clone()),
@@ -177,7 +177,7 @@ impl Work<'_> {
         address: Option<u8>,
         moonraker: Option<&str>,
     ) -> Result<(), String> {
-        let side = Side::new(self.computer, Some(target.owner));
+        let editor = Editor::new(self.computer, Some(target.owner));
         let (mcu, link, is_missing) = target.mcu(self.args.mcu.as_deref())?;
         if self.computer.is_this() && !self.args.dry_run && !serves(self.computer, &link) {
             // Without its MCU, klippy would not start with the new sections.
@@ -196,9 +196,9 @@ impl Work<'_> {
             ));
         } else {
             let sections = self.sections(target, &mcu, wires, address)?;
-            let edits = target.plan(&side, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
+            let edits = target.plan(&editor, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
             is_changed = !edits.is_empty();
-            make(self.args, moonraker, &side, &edits, "Write this?", self.report)?;
+            make(self.args, moonraker, &editor, &edits, "Write this?", self.report)?;
         }
         if self.args.dry_run {
             self.report.line("Nothing was changed (--dry-run).");

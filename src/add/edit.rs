@@ -55,8 +55,8 @@ impl Edit {
     }
 }
 
-/// A side of the computer where files are changed: root's, or that of printer.cfg's owner.
-pub(super) struct Side<'a> {
+/// Reads and changes files of one owner, root or the owner of printer.cfg, with that user's rights.
+pub(super) struct Editor<'a> {
     pub(super) computer: &'a Computer,
     /// User and group whose files these are. `None`: the caller's.
     owner: Option<(u32, u32)>,
@@ -64,9 +64,9 @@ pub(super) struct Side<'a> {
     bytewise: RefCell<BTreeSet<PathBuf>>,
 }
 
-impl<'a> Side<'a> {
-    pub(super) fn new(computer: &'a Computer, owner: Option<(u32, u32)>) -> Side<'a> {
-        Side { computer, owner, bytewise: RefCell::default() }
+impl<'a> Editor<'a> {
+    pub(super) fn new(computer: &'a Computer, owner: Option<(u32, u32)>) -> Editor<'a> {
+        Editor { computer, owner, bytewise: RefCell::default() }
     }
 
     /// Whether only root may change these files.
