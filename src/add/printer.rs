@@ -346,10 +346,10 @@ impl Target {
                     let kept = file.with_extension("cfg.removed");
                     let old = editor.read(&kept)?;
                     edits.push(Edit { file: kept.clone(), old, new: Some(text.to_owned()) });
-                    left.push(format!("{} was changed since: {} keeps it", file.display(), kept.display()));
+                    left.push(format!("{} was changed later: {} keeps it", file.display(), kept.display()));
                 }
             }
-            Some((_, None)) => left.push(format!("{} is not a file of pinion add, and stays", file.display())),
+            Some((_, None)) => left.push(format!("{} was not written by pinion add, so it stays", file.display())),
             None => {}
         }
         let mut stays: Vec<&Section> = self.others(&file).collect();

@@ -71,7 +71,7 @@ pub(super) fn undo(
         return Ok(());
     }
     if computer.is_this() && !boot.is_empty() && !geteuid().is_root() {
-        return Err(format!("some of these files are root's: {}", command(args, true)));
+        return Err(format!("root owns some of these files: {}", command(args, true)));
     }
     // Change nothing before both owners' files can be changed.
     root.probe(boot.iter().map(|edit| edit.file.clone()))?;
@@ -101,7 +101,7 @@ pub(super) fn undo(
         let restarted = Moonraker(&address).restart();
         report.set("warning", json!(restarted.as_ref().err()));
         report.line(match restarted {
-            Ok(()) => "The host has restarted without it.".to_owned(),
+            Ok(()) => "The host has restarted without the device.".to_owned(),
             Err(why) => format!("{why}: run FIRMWARE_RESTART in the host"),
         });
     }
@@ -130,7 +130,7 @@ impl Needs<'_> {
             let mut new = old.clone();
             let keeps = |what: &str, (user, place): &(String, PathBuf), left: &mut Vec<String>| {
                 left.push(format!(
-                    "{} keeps \"{what}\": {user} ({}) needs it. Call this again when it does not",
+                    "{} keeps \"{what}\": {user} ({}) still needs it. Run this command again when it no longer does",
                     file.display(),
                     place.display()
                 ));
@@ -139,7 +139,7 @@ impl Needs<'_> {
                 Boot::ConfigTxt => {
                     if boot::has_changed_lines(&old, &own) {
                         left.push(format!(
-                            "{} keeps lines below \"# pinion add {own}\": they were changed since",
+                            "{} keeps lines below \"# pinion add {own}\": they were changed later",
                             file.display()
                         ));
                     }

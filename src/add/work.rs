@@ -100,7 +100,7 @@ impl Work<'_> {
                 self.report.set("reboot", json!(true));
                 self.report.line("The bus is there after a reboot. Connect the wires while the power is off:");
                 self.report.line("  sudo poweroff");
-                self.report.line(format_args!("Then call \"{}\" again.", command(self.args, false)));
+                self.report.line(format_args!("Then run \"{}\" again.", command(self.args, false)));
                 return Ok(());
             }
         }
@@ -161,7 +161,7 @@ impl Work<'_> {
         if let Some(path) = &self.args.picture {
             // Another file has probably a name by mistake.
             if std::fs::read(path).is_ok_and(|bytes| !bytes.starts_with(b"<svg ")) {
-                return Err(format!("{} exists, and is not a picture: name another file", path.display()));
+                return Err(format!("{} exists but is not a picture: name another file", path.display()));
             }
             let svg = picture::svg(board, &device.title, wires);
             Output::check(path, &[])?.write(|out| io::Write::write_all(out, svg.as_bytes()))?;
@@ -191,7 +191,7 @@ impl Work<'_> {
         if let Some(section) = &self.search.there {
             let place = target.config().section(section).map_or(String::new(), |section| section.place.to_string());
             self.report.line(format_args!(
-                "[{section}] is in printer.cfg already ({place}), and stays as it is. For a second one: {} --name NAME",
+                "[{section}] is already in printer.cfg ({place}), and stays as it is. For a second device: {} --name NAME",
                 command(&AddArgs { name: None, ..self.args.clone() }, false)
             ));
         } else {
@@ -248,7 +248,7 @@ impl Work<'_> {
         }
         if text.contains("{serial_no}") {
             let serial = self.thermometer(Some(target)).ok_or(
-                "the thermometer's number is not known before it answers: boot the board with it, then call this again",
+                "the thermometer's number is not known before it answers: boot the board with the thermometer, then run this command again",
             )?;
             text = text.replace("{serial_no}", &serial);
         }
@@ -260,7 +260,7 @@ impl Work<'_> {
 fn loaded(modprobe: io::Result<ExitStatus>) -> Result<State, String> {
     match modprobe {
         Ok(status) if status.success() => Ok(State::There),
-        _ => Err("modprobe i2c-dev failed: reboot, then call this again".into()),
+        _ => Err("modprobe i2c-dev failed: reboot, then run this command again".into()),
     }
 }
 
