@@ -118,7 +118,7 @@ impl HeaterConfig {
             return self.thermistor().map(|thermistor| Some(Sensor::Thermistor(thermistor)));
         }
         if !self.points_celsius_ohm.is_empty() {
-            return Err(fault(whose, POINTS, "it has points_celsius_ohm, too", "remove one of them"));
+            return Err(fault(whose, POINTS, "it also has points_celsius_ohm", "remove one of them"));
         }
         for (celsius, fraction) in &self.points_celsius_fraction {
             check(whose, POINTS, *celsius, Bound::Any)?;

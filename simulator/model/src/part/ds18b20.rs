@@ -43,7 +43,7 @@ impl Part for Ds18b20Config {
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.serial.is_empty() || !self.serial.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)) {
-            let cause = format!("`{}` is no name of a device", self.serial);
+            let cause = format!("`{}` is not the name of a device", self.serial);
             return wrong(whose, "serial", &cause, "give `28-` and twelve hexadecimal digits");
         }
         check(whose, "conversion_ms", self.conversion_ms as f64, Bound::NotNegative)?;

@@ -163,11 +163,11 @@ impl Part for Ldc1612Config {
             check(whose, key, value, bound)?;
         }
         if self.drive_current > MAX_CURRENT {
-            let cause = format!("{} is no current of the chip", self.drive_current);
+            let cause = format!("{} is not a current of the chip", self.drive_current);
             return wrong(whose, "drive_current", &cause, &format!("give 0 to {MAX_CURRENT}"));
         }
         if self.yielding > 1.0 {
-            return wrong(whose, "yielding", "the bed gives way by more than all", "give a share of 1");
+            return wrong(whose, "yielding", "the bed cannot give way by more than all", "give a share of 1");
         }
         Ok(())
     }

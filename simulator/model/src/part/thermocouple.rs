@@ -133,7 +133,7 @@ impl Part for ThermocoupleConfig {
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
-            let cause = format!("what a {} makes of that is not known", self.chip.name());
+            let cause = format!("the answer of a {} to it is unknown", self.chip.name());
             return wrong(whose, "fault", &cause, "choose `open` or `shorted`");
         }
         check(whose, "chip_celsius", self.chip_celsius, Bound::Any)?;

@@ -115,14 +115,14 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         let (most, range) = if MODEL == 2209 { (3, "0 to 3") } else { (0, "0") };
         if self.address > most {
-            return wrong(whose, "address", &format!("{} is none", self.address), &format!("give {range}"));
+            return wrong(whose, "address", &format!("{} is not an address", self.address), &format!("give {range}"));
         }
         if !(1..=SG_MAX).contains(&self.sg_free) {
-            return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give 1 to 511");
+            return wrong(whose, "sg_free", &format!("{} is not an SG_RESULT", self.sg_free), "give 1 to 511");
         }
         match (&self.uart_pin, &self.uart_port) {
             (None, None) => return wrong(whose, "uart_pin", "it has none", "add it, or `uart_port`"),
-            (Some(_), Some(_)) => return wrong(whose, "uart_port", "it has a uart_pin, too", "remove one of them"),
+            (Some(_), Some(_)) => return wrong(whose, "uart_port", "it also has a uart_pin", "remove one of them"),
             _ => {}
         }
         if self.uart_port.is_some() && self.tx_pin.is_some() {

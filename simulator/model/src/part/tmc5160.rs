@@ -203,7 +203,7 @@ impl Part for Tmc2240UartConfig {
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.address > 7 {
-            return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 7");
+            return wrong(whose, "address", &format!("{} is not an address", self.address), "give 0 to 7");
         }
         check_pins(whose, self.uart_pins())?;
         check_sg_free(whose, self.sg_free)?;
@@ -246,7 +246,7 @@ fn stall_output(cfg: &mut Sections, layout: &Layout<'_>, driver: &str, axis: &st
 fn check_sg_free(whose: &str, sg_free: i32) -> Result<(), Trouble> {
     match sg_free {
         -1000..=1000 => Ok(()),
-        _ => wrong(whose, "sg_free", &format!("{sg_free} is no SG_RESULT"), "give -1000 to 1000"),
+        _ => wrong(whose, "sg_free", &format!("{sg_free} is not an SG_RESULT"), "give -1000 to 1000"),
     }
 }
 

@@ -111,7 +111,7 @@ pub(crate) fn check_pins<'a>(
     pins: impl IntoIterator<Item = (&'static str, Option<&'a PinName>)>,
 ) -> Result<(), Trouble> {
     let inverted = pins.into_iter().find(|(_, pin)| pin.is_some_and(|pin| pin.inverted));
-    inverted.map_or(Ok(()), |(key, _)| wrong(whose, key, "klippy inverts no UART", "remove the `!`"))
+    inverted.map_or(Ok(()), |(key, _)| wrong(whose, key, "klippy cannot invert a UART", "remove the `!`"))
 }
 
 /// The keys for the lines of a multiplexer.
