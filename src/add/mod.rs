@@ -146,7 +146,7 @@ fn added(args: &AddArgs, computer: &Computer, board: Option<Board>, report: &mut
     }
     let driver = device.way.iter().find_map(|way| way.driver.as_deref()).filter(|_| args.name.is_some());
     if let Some(driver) = driver.filter(|_| !args.undo) {
-        return Err(format!("--name: printer.cfg cannot name a second {driver}: its channels have the driver's name"));
+        return Err(format!("--name: printer.cfg can name only one {driver}: its channels have the driver's name"));
     }
     if args.config.is_some()
         && let Err(why) = &target

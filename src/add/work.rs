@@ -148,10 +148,10 @@ impl Work<'_> {
         self.report.page.append(&picture::page(board, wires));
         self.report.line("");
         self.report.line(format_args!("  level: {}", board.level));
-        self.report.line(format_args!("  mind:  {}", device.trap));
+        self.report.line(format_args!("  note:  {}", device.trap));
         for one in self.search.uses.unknown() {
             self.report.line(format_args!(
-                "  mind:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
+                "  note:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
                 one.place, one.user
             ));
         }
