@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::printer::Printer;
+use crate::description::whole;
 use crate::engine::physics::Heater;
 use crate::engine::time::pass;
 use crate::klippy::layout::Layout;
@@ -28,12 +29,8 @@ pub struct Ds18b20Config {
     /// The heater that it measures.
     pub heater: String,
     /// How long a reading takes.
-    #[serde(default = "default_conversion_ms")]
+    #[serde(default = "whole::<750, _>")]
     pub conversion_ms: u64,
-}
-
-fn default_conversion_ms() -> u64 {
-    750
 }
 
 impl Part for Ds18b20Config {
