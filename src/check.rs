@@ -83,7 +83,7 @@ fn board(settings: &Settings, simulated: Open) -> Vec<Finding> {
     findings.push(match Dialect::new(&FIRMWARE, &*board, name) {
         Ok(_) => match settings.dialect {
             Some(name) => Finding::ok("dialect", format!("dialect {name}")),
-            None => Finding::ok("dialect", "messages of whichever host comes"),
+            None => Finding::ok("dialect", "messages of any host"),
         },
         Err(error) => Finding::error("dialect", format!("dialect {name}: {error}"), "choose another"),
     });
@@ -119,7 +119,7 @@ pub(crate) fn wire(link: &LinkName) -> Finding {
             if let Err(trouble) = uart::find_line(port) {
                 Finding::of("link", Level::Error, trouble)
             } else if access(port.as_path(), AccessFlags::R_OK | AccessFlags::W_OK).is_err() {
-                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev shows it)";
+                let remedy = "run Pinion as another user, or add this user to the port's group (ls -l /dev shows it)";
                 Finding::error("link", format!("{path} may not be opened by this user"), remedy)
             } else {
                 Finding::ok("link", format!("{link}: {path} is there"))
@@ -168,13 +168,13 @@ fn link(symlink: &Path) -> Finding {
     };
     if access(folder, AccessFlags::W_OK | AccessFlags::X_OK).is_err() {
         let remedy = "run Pinion as another user, or choose another path (symlink)";
-        return Finding::error("symlink", format!("{path}: nothing may be written in {}", folder.display()), remedy);
+        return Finding::error("symlink", format!("{path}: this user may not write in {}", folder.display()), remedy);
     }
     // As a rule, this is the program that is about to be restarted.
     if let Some(served) = pinion_runtime::served(symlink)
         && !leads_to_ours(symlink)
     {
-        return Finding::ok("symlink", format!("no other program can serve there meanwhile: {served}"));
+        return Finding::ok("symlink", format!("no second program can serve there: {served}"));
     }
     let place = Place::of(symlink);
     if let Some(obstacle) = place.obstacle(symlink) {
@@ -200,8 +200,8 @@ fn link(symlink: &Path) -> Finding {
         Ok(there) if about_folder.mode() & 0o1000 != 0 && !is_one_of(&[there.uid(), about_folder.uid()]) => {
             Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {}", word(&path)))
         }
-        Ok(_) => Finding::ok("symlink", format!("{path} is a link, and will be replaced")),
-        Err(_) => Finding::ok("symlink", format!("{path} can be made")),
+        Ok(_) => Finding::ok("symlink", format!("{path} is a link, which will be replaced")),
+        Err(_) => Finding::ok("symlink", format!("{path} can be created")),
     }
 }
 
@@ -294,7 +294,7 @@ mod tests {
         std::os::unix::fs::symlink(&path, &own).unwrap();
         assert_eq!(link(&path).status, Level::Ok);
         std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
-        assert!(link(&path).trouble.cause.ends_with("is a link, and will be replaced"));
+        assert!(link(&path).trouble.cause.ends_with("is a link, which will be replaced"));
         fs::remove_file(&own).unwrap();
         fs::remove_file(&path).unwrap();
         fs::write(&path, "").unwrap();

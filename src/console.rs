@@ -96,7 +96,7 @@ fn free(pty: &Path) -> Result<(), String> {
     match &hosts(pty)?[..] {
         [] => Ok(()),
         hidden => Err(format!(
-            "{} may have {} open, and may not be looked into: stop it first, or use sudo",
+            "{} may have {} open, but this user may not inspect that process: stop it first, or use sudo",
             names(hidden),
             pty.display()
         )),
@@ -153,7 +153,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
     let hang_up = pinion_runtime::hang_up().map_err(|error| error.to_string())?;
     for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
-            .map_err(|error| format!("signals cannot be taken in: {error}"))?;
+            .map_err(|error| format!("signals cannot be received: {error}"))?;
     }
     // The lines about each event are for a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
@@ -198,7 +198,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
     said.unwrap_or_else(|| {
         logging::finish();
         let signal = signal.load(Ordering::Relaxed).try_into().unwrap_or_default();
-        Err(format!("a signal ended it, which cannot be passed on: {:?}", emulate_default_handler(signal)))
+        Err(format!("a signal ended the console and cannot be passed on: {:?}", emulate_default_handler(signal)))
     })
 }
 
@@ -236,7 +236,7 @@ fn script(mut console: Console, mut lines: impl BufRead) -> Result<(), String> {
         line.clear();
         match lines.by_ref().take(LINE_MAX).read_line(&mut line) {
             Ok(0) => break,
-            Ok(_) if line.len() as u64 == LINE_MAX => return Err(format!("line {number}: it is too long: divide it")),
+            Ok(_) if line.len() as u64 == LINE_MAX => return Err(format!("line {number} is too long: divide it")),
             Ok(_) => {}
             Err(error) => return Err(format!("line {number} cannot be read: {error}")),
         }

@@ -203,7 +203,7 @@ fn not_permitted(link: &Path, file: &Path) -> String {
     let is_other = |about: Metadata| !is_socket && !is_pseudo_terminal(&about);
     let remedy = match Opener::of(file).command() {
         _ if file.metadata().is_ok_and(is_other) => "name the link of a Pinion".to_owned(),
-        Some(command) => format!("\"{command}\" and log in anew, or use sudo"),
+        Some(command) => format!("\"{command}\" and log in again, or use sudo"),
         None => "use sudo".to_owned(),
     };
     format!("{} may not be opened by this user: {remedy}", link.display())

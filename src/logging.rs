@@ -145,7 +145,7 @@ impl Queue {
         self.lines.pop_front().or_else(|| {
             let lost = std::mem::take(&mut self.lost);
             let were = if lost == 1 { "line of the log was" } else { "lines of the log were" };
-            (lost > 0).then(|| style.line(Level::Warn, format_args!("{lost} {were} lost, as nobody read it")))
+            (lost > 0).then(|| style.line(Level::Warn, format_args!("{lost} {were} lost, because nobody read the log")))
         })
     }
 
@@ -330,7 +330,7 @@ mod tests {
         let lines: Vec<String> = std::iter::from_fn(|| queue.pop(Style::Plain)).collect();
         let (loss, kept) = lines.split_last().unwrap();
         assert_eq!(kept, (0..LINES_MAX).map(|n| n.to_string()).collect::<Vec<_>>());
-        assert!(loss.ends_with("WARN  3 lines of the log were lost, as nobody read it\n"), "{loss}");
+        assert!(loss.ends_with("WARN  3 lines of the log were lost, because nobody read the log\n"), "{loss}");
         assert!(queue.is_done());
     }
 

@@ -80,9 +80,11 @@ fn nothing(args: &PinsArgs) -> String {
     match &args.filter {
         Some(filter) => format!("nothing here has \"{filter}\" in a name: pinion pins lists all"),
         None if args.free => "no GPIO line is free: pinion pins lists who holds them".to_owned(),
-        None => "no GPIO chip, ADC, PWM, SPI, I2C, 1-Wire device or serial port is to be seen: enable them in the device tree \
+        None => {
+            "no GPIO chip, ADC, PWM, SPI, I2C, 1-Wire device or serial port was found: enable them in the device tree \
                  (pinion doctor says how), or try \"pinion run --board sim\""
-            .to_owned(),
+                .to_owned()
+        }
     }
 }
 

@@ -38,7 +38,7 @@ pub(crate) fn start(arguments: &[OsString]) -> Trouble {
     let remedy = "sudo apt install pinion-sim, or in the sources: make build";
     match error.kind() {
         io::ErrorKind::NotFound => {
-            Trouble::new(format!("the simulated printer is a program of its own, {PROGRAM}, and it is not installed"))
+            Trouble::new(format!("the simulated printer is the program {PROGRAM}, which is not installed"))
         }
         _ => Trouble::new(error.to_string()).of(Path::new(program).display()),
     }

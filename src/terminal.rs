@@ -153,7 +153,7 @@ fn give_back_at_panic() {
 /// Makes these signals give the terminal back, and then end the program as they do by themselves. The program has
 /// `grace` to end in order.
 pub fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), String> {
-    let mut signals = Signals::new(signals).map_err(|error| format!("signals cannot be taken in: {error}"))?;
+    let mut signals = Signals::new(signals).map_err(|error| format!("signals cannot be received: {error}"))?;
     let wait = move || {
         for signal in signals.forever() {
             thread::sleep(grace);

@@ -13,7 +13,7 @@
 
 use std::collections::BTreeSet;
 
-use super::side::MARK;
+use super::edit::MARK;
 use pinion_system::board::Bus;
 use pinion_system::uses::boot::{ConfigTxt, Env};
 
@@ -100,7 +100,7 @@ pub(super) fn overlays(text: &str, bus: &Bus, files: &BTreeSet<String>, device: 
         let kind = bus.node.trim_end_matches(|c: char| !c.is_alphabetic()).trim_end_matches("dev");
         let near: Vec<&str> = files.iter().map(String::as_str).filter(|file| file.contains(kind)).take(8).collect();
         return Err(match near[..] {
-            [] => format!("this image has no overlay for {}: look for one in its documentation", bus.node),
+            [] => format!("this image has no overlay for {}: look for one in the image's documentation", bus.node),
             _ => format!(
                 "none of the known overlays for {} is in this image, which has {}: write the right one into overlays=",
                 bus.node,
@@ -145,7 +145,7 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
             let value = Env::of(&text).value("overlays").unwrap_or_default();
             let words: Vec<&str> = value.split_whitespace().collect();
             if !words.contains(&word) {
-                left.push(format!("overlays= has no {word} any more"));
+                left.push(format!("overlays= no longer has {word}"));
                 continue;
             }
             // The user's own spaces stay.
@@ -160,7 +160,7 @@ pub(super) fn without_settings(text: &str, device: &str, left: &mut Vec<String>)
             continue;
         };
         if Env::of(&text).value(key) != Some(value) {
-            left.push(format!("{key} is not {value} any more, and stays"));
+            left.push(format!("{key} is no longer {value}, so it stays as it is"));
             continue;
         }
         text = was.strip_prefix("was ").map_or_else(|| unset(&text, key), |old| set(&text, key, old));
@@ -336,7 +336,7 @@ mod tests {
         let changed = text.replace("param_spidev_spi_bus=1\n", "param_spidev_spi_bus=10\n");
         let back = without_settings(&changed, "x", &mut left);
         assert_eq!(back, "overlay_prefix=sun50i-h616\nparam_spidev_spi_bus=10\n");
-        assert_eq!(left, ["param_spidev_spi_bus is not 1 any more, and stays"]);
+        assert_eq!(left, ["param_spidev_spi_bus is no longer 1, so it stays as it is"]);
     }
 
     proptest! {

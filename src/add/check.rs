@@ -62,13 +62,13 @@ impl Work<'_> {
         self.report.show()?;
         match asked {
             Ok(answer) => Ok(answer.address),
-            Err(why) => Err(format!("{}: {why}: then call \"{}\" again", self.device.name, command(self.args, false))),
+            Err(why) => Err(format!("{}: {why}: then run \"{}\" again", self.device.name, command(self.args, false))),
         }
     }
 
     /// Reads a value of the chip by its driver, which does not know whether the chip is there.
     fn sample(&self, file: &str, highest: u32) -> Result<Answer, String> {
-        let folder = self.iio().ok_or("its driver has gone: reboot")?;
+        let folder = self.iio().ok_or("the chip's driver is gone: reboot")?;
         let path = self.computer.name(&folder.join(file));
         let read = |_| self.computer.text(&path)?.parse().ok();
         let values: Option<Vec<u32>> = (0..SAMPLES).map(read).collect();

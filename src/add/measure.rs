@@ -66,7 +66,7 @@ impl Work<'_> {
             let lines: Vec<&str> = lines.iter().map(|line| line.trim_start_matches("// ")).collect();
             return Ok(format!("{command}: {}", lines.join("; ")));
         }
-        Ok("the host has restarted with it".into())
+        Ok("the host has restarted with the device".into())
     }
 }
 
@@ -101,7 +101,7 @@ fn turns(moonraker: &Moonraker, section: &str, fan: &str) -> Result<String, Stri
     match counted? {
         rpm if rpm > 0.0 => Ok(format!("the tachometer counts {rpm:.0} turns a minute at full speed")),
         _ => {
-            Err("the tachometer counts nothing at full speed: check that the fan runs, and the wire of its tachometer"
+            Err("the tachometer counts nothing at full speed: check that the fan runs, and check the tachometer's wire"
                 .into())
         }
     }

@@ -22,7 +22,7 @@ pub(crate) fn missing(computer: &Computer, uses: &Uses) -> Vec<Finding> {
         if computer.exists(&file) {
             return None;
         }
-        let found = format!("[{}] in printer.cfg needs {file}, which is not there", section.name);
+        let found = format!("[{}] in printer.cfg needs {file}, which does not exist", section.name);
         let is_it =
             |device: &&Device| device.is_chip_of(section) || section.kind() == "neopixel" && device.name == "ws2812";
         let remedy = match catalog.devices.iter().find(is_it) {

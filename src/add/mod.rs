@@ -25,6 +25,7 @@ use pinion_system::uses::{Resource, Source, Uses};
 mod boot;
 mod catalog;
 mod check;
+mod edit;
 mod list;
 mod measure;
 mod missing;
@@ -35,18 +36,17 @@ mod plan;
 mod printer;
 mod probe;
 mod report;
-mod side;
 mod undo;
 mod work;
 
 use catalog::{Catalog, Device, Wiring};
+use edit::{Edit, Editor};
 pub(super) use missing::missing;
 use moonraker::{Host, Moonraker};
 use place::Search;
 pub(super) use place::Wire;
 use printer::Target;
 use report::Report;
-use side::{Edit, Side};
 use work::Work;
 
 /// The buses that a user may choose between.
@@ -142,13 +142,11 @@ fn added(args: &AddArgs, computer: &Computer, board: Option<Board>, report: &mut
         && device.wants_first
         && target.as_ref().is_ok_and(|target| target.config().section(&device.section(None)).is_none())
     {
-        return Err(format!("--name: the first one has no name: pinion add {}", device.name));
+        return Err(format!("--name: the first device of its kind has no name: pinion add {}", device.name));
     }
     let driver = device.way.iter().find_map(|way| way.driver.as_deref()).filter(|_| args.name.is_some());
     if let Some(driver) = driver.filter(|_| !args.undo) {
-        return Err(format!(
-            "--name: only one {driver} has a name in printer.cfg, because its channels have the driver's"
-        ));
+        return Err(format!("--name: printer.cfg can name only one {driver}: its channels have the driver's name"));
     }
     if args.config.is_some()
         && let Err(why) = &target
@@ -190,7 +188,7 @@ fn existing(target: &Target, device: &Device, args: &AddArgs) -> Result<Option<S
     let named = target.others(&own).find(|section| section.name == wanted);
     if let Some(section) = named.filter(|section| !target.is_here(section)) {
         return Err(format!(
-            "[{wanted}] ({}) is on the MCU {}: give this one another name: pinion add {} --name NAME",
+            "[{wanted}] ({}) is on the MCU {}: give this device another name: pinion add {} --name NAME",
             section.place,
             target.mcu_of(section),
             device.name
@@ -266,7 +264,7 @@ fn place<'a>(
         && args.bus.is_some()
     {
         return Err(format!(
-            "--bus: {} is connected by {} already: take it back with --undo first, or add a second one with --name",
+            "--bus: {} is already connected by {}: take that back with --undo first, or add a second device with --name",
             device.name,
             way.bus.name()
         ));
@@ -312,10 +310,10 @@ fn refuse_while_printing(computer: &Computer, moonraker: Option<&str>) -> Result
     let Some(address) = moonraker else { return Ok(()) };
     match Moonraker(address).host() {
         Host::Rests => Ok(()),
-        Host::Prints => Err("the host prints: call it again when the print has ended".into()),
+        Host::Prints => Err("the host prints: run this command again after the print".into()),
         Host::Unknown(_) if computer.processes(Process::is_klippy).next().is_none() => Ok(()),
         Host::Unknown(why) => Err(format!(
-            "klippy runs, and nobody says whether it prints: {why}: start Moonraker, or stop klippy (sudo systemctl \
+            "klippy runs, but whether it prints is unknown: {why}: start Moonraker, or stop klippy (sudo systemctl \
              stop klipper)"
         )),
     }
@@ -337,7 +335,7 @@ fn ask(
         return Ok(());
     }
     if args.json || !io::stdin().is_terminal() {
-        return Err(format!("{refused}: nobody can be asked here: call it with --yes"));
+        return Err(format!("{refused}: there is no terminal to ask: use --yes"));
     }
     report.line(format_args!("{question} [y/N]"));
     report.show()?;
@@ -381,7 +379,7 @@ fn command(args: &AddArgs, undo: bool) -> String {
 fn make(
     args: &AddArgs,
     moonraker: Option<&str>,
-    side: &Side,
+    editor: &Editor,
     edits: &[Edit],
     question: &str,
     report: &mut Report,
@@ -406,13 +404,13 @@ fn make(
     if args.dry_run || edits.is_empty() {
         return Ok(());
     }
-    if side.computer.is_this() && side.is_root_s() && !geteuid().is_root() {
-        return Err(format!("these files are root's: {}", command(args, args.undo)));
+    if editor.computer.is_this() && editor.is_root_s() && !geteuid().is_root() {
+        return Err(format!("root owns these files: {}", command(args, args.undo)));
     }
     if !question.is_empty() {
-        ask(args, side.computer, moonraker, report, question)?;
+        ask(args, editor.computer, moonraker, report, question)?;
     }
-    for told in side.make(edits)? {
+    for told in editor.make(edits)? {
         report.line(told);
     }
     report.changed.extend(edits.iter().map(|edit| edit.file.display().to_string()));

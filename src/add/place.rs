@@ -158,7 +158,7 @@ impl Search<'_> {
         let board = self.board;
         let has_line = way.wires.iter().any(|(_, role)| role == "line");
         if pin.is_some() && !has_line {
-            return Err(format!("--pin: {} has no line of its own here: leave --pin out", device.name));
+            return Err(format!("--pin: {} needs no line here: leave out --pin", device.name));
         }
         let earlier = |role: &str| {
             let line = self.uses.names.line(written.get(role)?)?;
@@ -175,7 +175,7 @@ impl Search<'_> {
                     && there != named
                 {
                     return Err(format!(
-                        "--pin: {} is on {} (pin {there}) already: take it back with --undo first, or add a second one with --name",
+                        "--pin: {} is already on {} (pin {there}): take that back with --undo first, or add a second device with --name",
                         device.name,
                         board.label(there)
                     ));

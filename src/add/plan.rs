@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::boot;
+use super::edit::{Edit, Editor};
 use super::place::config_lines;
-use super::side::{Edit, Side};
 use super::work::{State, Work};
 use pinion_system::Computer;
 use pinion_system::board::{Boot, Kind};
@@ -22,7 +22,7 @@ impl Work<'_> {
         let Some(bus) = self.board.bus.get(&self.way.bus) else { return Ok((Vec::new(), State::There)) };
         let is_there = self.is_there(self.node());
         let file = self.board.file(self.computer);
-        let side = Side::new(self.computer, None);
+        let editor = Editor::new(self.computer, None);
         let own = config_lines(self.way, &self.spot);
         let device = self.device.file(self.name());
         let mut edits = Vec::new();
@@ -39,12 +39,12 @@ impl Work<'_> {
         }
         let new = match (self.board.boot, file) {
             (Boot::ConfigTxt, Some(file)) if !wanted.is_empty() => {
-                let text = side.read(Path::new(file))?.unwrap_or_default();
+                let text = editor.read(Path::new(file))?.unwrap_or_default();
                 let new = boot::config_txt(&text, &self.search.uses.config_txt, &device, &wanted);
                 Some((file, text, new))
             }
             (Boot::Overlays, Some(file)) if !is_there => {
-                let text = side.read(Path::new(file))?.unwrap_or_default();
+                let text = editor.read(Path::new(file))?.unwrap_or_default();
                 let new = boot::overlays(&text, bus, &overlays(self.computer), &device);
                 let new = new.map_err(|why| format!("{file}: {why}"))?;
                 Some((file, text, new))

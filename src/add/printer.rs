@@ -19,7 +19,7 @@ use pinion_system::printer::{LINK, Printer};
 use pinion_system::uses::Use;
 
 use super::catalog::{Catalog, Device, Wiring};
-use super::side::{Edit, MARK, Side};
+use super::edit::{Edit, Editor, MARK};
 
 /// How high above the bed resonances are measured, in millimeters (docs/Measuring_Resonances.md of Klipper).
 const PROBE_Z_MM: f64 = 20.0;
@@ -109,8 +109,8 @@ impl Target {
             return Err(format!("{}: it is a link: name the file that it leads to: --config {target}", file.display()));
         }
         let owner = (about.uid(), about.gid());
-        let side = Side::new(computer, Some(owner));
-        let text = side.read(&file)?.unwrap_or_default();
+        let editor = Editor::new(computer, Some(owner));
+        let text = editor.read(&file)?.unwrap_or_default();
         let printer = Printer::read(computer, &path).map_err(|trouble| trouble.to_string())?;
         let mcus = printer.own_mcus(computer, mcu);
         Ok(Target { path, file, owner, text, printer, mcus })
@@ -267,7 +267,7 @@ impl Target {
     /// One line: a file in the way cannot be read.
     pub(super) fn plan(
         &self,
-        side: &Side,
+        editor: &Editor,
         device: &Device,
         name: Option<&str>,
         sections: &str,
@@ -277,7 +277,7 @@ impl Target {
         let mut make = |name: &str, text: String| -> Result<(), String> {
             let file = self.file(name);
             // A file that is there is left as it is: the user may have changed it.
-            if side.read(&file)?.is_none() {
+            if editor.read(&file)?.is_none() {
                 edits.push(Edit { file, old: None, new: Some(text) });
             }
             Ok(())
@@ -327,7 +327,7 @@ impl Target {
     /// One line: a file cannot be read.
     pub(super) fn plan_undo(
         &self,
-        side: &Side,
+        editor: &Editor,
         catalog: &Catalog,
         device: &Device,
         name: Option<&str>,
@@ -337,29 +337,29 @@ impl Target {
         let stem = device.file(name);
         let file = self.file(&stem);
         let gone = |file: &Path, text: &str| Edit { file: file.to_owned(), old: Some(text.to_owned()), new: None };
-        let text = side.read(&file)?;
+        let text = editor.read(&file)?;
         match text.as_deref().map(|text| (text, is_ours(text))) {
             Some((text, Some(is_unchanged))) => {
                 edits.push(gone(&file, text));
                 if !is_unchanged {
                     // klippy does not read it under this name.
                     let kept = file.with_extension("cfg.removed");
-                    let old = side.read(&kept)?;
+                    let old = editor.read(&kept)?;
                     edits.push(Edit { file: kept.clone(), old, new: Some(text.to_owned()) });
-                    left.push(format!("{} was changed since: {} keeps it", file.display(), kept.display()));
+                    left.push(format!("{} was changed later: {} keeps it", file.display(), kept.display()));
                 }
             }
-            Some((_, None)) => left.push(format!("{} is not a file of pinion add, and stays", file.display())),
+            Some((_, None)) => left.push(format!("{} was not written by pinion add, so it stays", file.display())),
             None => {}
         }
         let mut stays: Vec<&Section> = self.others(&file).collect();
         // Another accelerometer goes on measuring resonances.
         let resonances = self.file(RESONANCES);
         let shared = [self.file(MCU), resonances.clone(), file.clone()];
-        let others = side.computer.matching(self.folder().join("*.cfg"));
+        let others = editor.computer.matching(self.folder().join("*.cfg"));
         let others: Vec<PathBuf> =
-            others.iter().map(|path| side.computer.name(path)).filter(|path| !shared.contains(path)).collect();
-        if let Some(text) = side.read(&resonances)?.filter(|text| is_ours(text) == Some(true)) {
+            others.iter().map(|path| editor.computer.name(path)).filter(|path| !shared.contains(path)).collect();
+        if let Some(text) = editor.read(&resonances)?.filter(|text| is_ours(text) == Some(true)) {
             let chip = self.config().section(RESONANCES).and_then(|section| section.text("accel_chip"));
             let is_other =
                 |section: &&&Section| catalog.devices.iter().any(|other| other.resonance && other.is_chip_of(section));
@@ -377,7 +377,7 @@ impl Target {
             }
         }
         let mcu_file = self.file(MCU);
-        if let Some(text) = side.read(&mcu_file)?.filter(|text| is_ours(text) == Some(true)) {
+        if let Some(text) = editor.read(&mcu_file)?.filter(|text| is_ours(text) == Some(true)) {
             let own = self.config().of_kind("mcu").find(|section| self.is_in(section, &mcu_file));
             let mcu = own.map_or("", |section| section.name.trim_start_matches("mcu ").trim());
             let names_it = |section: &&&Section| {
@@ -399,8 +399,8 @@ impl Target {
             }
         }
         let goes = |file: &Path| edits.iter().any(|edit| edit.file == file && edit.new.is_none());
-        let remaining = side.computer.matching(self.folder().join("*.cfg"));
-        let mut remaining = remaining.iter().map(|path| side.computer.name(path)).filter(|path| !goes(path));
+        let remaining = editor.computer.matching(self.folder().join("*.cfg"));
+        let mut remaining = remaining.iter().map(|path| editor.computer.name(path)).filter(|path| !goes(path));
         // What klippy would still find of the device would be a section without its options.
         let saved: Vec<&str> = self
             .config()
@@ -421,7 +421,7 @@ impl Target {
             let is_include = |line: &&str| line.trim_end() == INCLUDE;
             match remaining.next() {
                 Some(other) => {
-                    if side.read(&other)?.is_none_or(|text| is_ours(&text).is_none()) {
+                    if editor.read(&other)?.is_none_or(|text| is_ours(&text).is_none()) {
                         left.push(format!("{} keeps its include: {} is there", self.file.display(), other.display()));
                     }
                 }
@@ -434,7 +434,7 @@ impl Target {
             }
         }
         match printer_cfg == self.text {
-            true => edits.extend(side.needless_copy(&self.file, &self.text)?),
+            true => edits.extend(editor.needless_copy(&self.file, &self.text)?),
             false => edits.push(Edit { file: self.file.clone(), old: Some(self.text.clone()), new: Some(printer_cfg) }),
         }
         Ok(edits)
@@ -492,9 +492,9 @@ mod tests {
         let catalog = Catalog::read().unwrap();
         let device = catalog.device(device).unwrap();
         let computer = tree.computer();
-        let side = Side::new(&computer, None);
+        let editor = Editor::new(&computer, None);
         let (mcu, _, is_missing) = target.mcu(None).unwrap();
-        let edits = target.plan(&side, device, None, "[x]\n", is_missing.then_some(&*mcu)).unwrap();
+        let edits = target.plan(&editor, device, None, "[x]\n", is_missing.then_some(&*mcu)).unwrap();
         let name = |edit: &Edit| edit.file.strip_prefix("/home/pi").unwrap_or(&edit.file).display().to_string();
         edits.iter().map(|edit| (name(edit).replace("printer_data/config/", ""), edit.new.clone().unwrap())).collect()
     }

@@ -132,7 +132,7 @@ pub(super) fn ask(catalog: &Catalog, way: &Wiring, addresses: &[u8], buses: &mut
         return Err(wrong);
     }
     let asked: Vec<String> = addresses.iter().map(|address| format!("{address:#04x}")).collect();
-    Err(format!("nobody answers at {}: check power, ground, and that SDA and SCL are not swapped", asked.join(" or ")))
+    Err(format!("no chip answers at {}: check power, ground, and that SDA and SCL are not swapped", asked.join(" or ")))
 }
 
 /// Why an I2C chip is not the expected one.
@@ -189,7 +189,7 @@ fn asked(
             // None of these chips measures less than 1/16 degree.
             match TEMPERATURES.contains(&degrees) && low & 0x0f == 0 {
                 true => Ok(format!("it measures {degrees:.1} degrees")),
-                false => Err(Failure::Wrong(format!("{degrees:.1} degrees is no temperature: it is another chip"))),
+                false => Err(Failure::Wrong(format!("{degrees:.1} degrees cannot be: this is another chip"))),
             }
         }
         Check::Fixed { .. } | Check::W1 | Check::Iio { .. } => Ok("it cannot be asked over I2C: try it out".into()),
@@ -226,7 +226,7 @@ fn judge(catalog: &Catalog, bus: Kind, register: u8, ids: &[u8], answers: &[u8])
         return Err(format!("{text}, shifted by a bit: shorten the wires, twist SCLK and CS each with ground"));
     }
     match catalog.with_id(register, first) {
-        Some(other) => Err(format!("{text}, that of another chip: pinion add {}", other.name)),
+        Some(other) => Err(format!("{text}, the id of another chip: pinion add {}", other.name)),
         None => Err(format!("{text}: it is another chip, or data wires are swapped")),
     }
 }
@@ -288,7 +288,7 @@ fn has_bits(answer: &[u8], mask: &[u8], bits: &[u8]) -> bool {
 fn silence(bus: Kind, answer: &[u8]) -> Option<String> {
     let is_all = |value: u8| answer.iter().all(|byte| *byte == value);
     let why = match (bus, is_all(0), is_all(0xff)) {
-        (Kind::I2c, true, _) => "all zeros: another chip holds SDA low, or it is broken",
+        (Kind::I2c, true, _) => "all zeros: another chip holds SDA low, or this chip is broken",
         (Kind::I2c, _, true) => "all ones: its power or ground is loose, or it is another chip",
         (_, true, _) => {
             "all zeros: no power, the chip's data output (SDO, MISO) or CS is not connected, or the pin is still GPIO"
@@ -390,7 +390,7 @@ mod tests {
             // Both were reported by users of Klipper.
             (0xf2, Some("0xf2 instead of 0xe5, shifted by a bit")),
             (0x72, Some("0x72 instead of 0xe5, shifted by a bit")),
-            (0xea, Some("that of another chip: pinion add icm20948")),
+            (0xea, Some("the id of another chip: pinion add icm20948")),
             (0x42, Some("it is another chip")),
         ] {
             let result = asked("adxl345", 0, &[(0, &[answer])]);
@@ -443,7 +443,7 @@ mod tests {
         // A stranger at the first address does not hide the chip at the second.
         assert_eq!(asked("bme280", 0, &[(0x76, &[0x12]), (0x77, &[0x60])]).unwrap().address, Some(0x77));
         let error = asked("bme280", 0, &[]).unwrap_err();
-        assert!(error.starts_with("nobody answers at 0x76 or 0x77: check power"), "{error}");
+        assert!(error.starts_with("no chip answers at 0x76 or 0x77: check power"), "{error}");
         let error = asked("mpu9250", 0, &[(0x69, &[0x19])]).unwrap_err();
         assert!(error.starts_with("at address 0x69: its id is 0x19 instead of 0x74"), "{error}");
         // It is on, off and on.
@@ -457,7 +457,7 @@ mod tests {
             "it measures 25.5 degrees at address 0x48"
         );
         assert_eq!(asked("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().text, "it measures -10.0 degrees at address 0x4f");
-        assert!(asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is no temperature"));
+        assert!(asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees cannot be"));
         // The example of the SHT3x's data sheet.
         assert_eq!(crc8(0xff, &[0xbe, 0xef]), 0x92);
         assert!(asked("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());
@@ -505,7 +505,7 @@ mod tests {
                 }
                 if !way.addresses.is_empty() {
                     let text = ask(&catalog, way, &way.addresses, &mut Chips::default()).unwrap_err();
-                    assert!(text.starts_with("nobody answers at 0x"), "{}: {text}", device.name);
+                    assert!(text.starts_with("no chip answers at 0x"), "{}: {text}", device.name);
                 }
             }
         }
@@ -574,7 +574,7 @@ mod tests {
         // It is an LM75.
         let error = chips.ask("ads1115").unwrap_err();
         assert!(error.starts_with("at address 0x48: it answers 4b 00, as this chip never does"), "{error}");
-        assert!(chips.ask("mpu9250").unwrap_err().starts_with("nobody answers at 0x68 or 0x69"));
+        assert!(chips.ask("mpu9250").unwrap_err().starts_with("no chip answers at 0x68 or 0x69"));
     }
 
     #[test]

@@ -14,11 +14,11 @@ use pinion_system::klippy::configs;
 use pinion_system::uses::{Resource, Source, Use, Uses};
 
 use super::catalog::{Catalog, Device};
+use super::edit::{Edit, Editor};
 use super::moonraker::Moonraker;
 use super::plan::{I2C_DEV, MODULES};
 use super::printer::Target;
 use super::report::Report;
-use super::side::{Edit, Side};
 use super::{AddArgs, ask, boot, command, make, moonraker_of, refuse_while_printing};
 
 /// Takes a device back.
@@ -33,16 +33,16 @@ pub(super) fn undo(
 ) -> Result<(), String> {
     let name = args.name.as_deref();
     let mut left = Vec::new();
-    let root = Side::new(computer, None);
+    let root = Editor::new(computer, None);
     let mut host = None;
     let mut own = Vec::new();
     match &target {
         Ok(target) => {
-            let side = Side::new(computer, Some(target.owner));
-            target.files().for_each(|file| side.sweep(&file));
-            side.sweep(&target.file(&device.file(name)));
-            own = target.plan_undo(&side, catalog, device, name, &mut left)?;
-            host = Some((side, target));
+            let editor = Editor::new(computer, Some(target.owner));
+            target.files().for_each(|file| editor.sweep(&file));
+            editor.sweep(&target.file(&device.file(name)));
+            own = target.plan_undo(&editor, catalog, device, name, &mut left)?;
+            host = Some((editor, target));
         }
         // Without its sections, nobody knows what is still needed.
         Err(why) if args.config.is_some() || !configs(computer).is_empty() => return Err(why.clone()),
@@ -61,8 +61,8 @@ pub(super) fn undo(
         refuse_while_printing(computer, moonraker.as_deref())?;
     }
     let dry = AddArgs { dry_run: true, ..args.clone() };
-    if let Some((side, _)) = &host {
-        make(&dry, None, side, &own, "", report)?;
+    if let Some((editor, _)) = &host {
+        make(&dry, None, editor, &own, "", report)?;
     }
     make(&dry, None, &root, &boot, "", report)?;
     left.iter().for_each(|line| report.line(line));
@@ -71,21 +71,21 @@ pub(super) fn undo(
         return Ok(());
     }
     if computer.is_this() && !boot.is_empty() && !geteuid().is_root() {
-        return Err(format!("some of these files are root's: {}", command(args, true)));
+        return Err(format!("root owns some of these files: {}", command(args, true)));
     }
-    // Neither side changes before the other one can.
+    // Change nothing before both owners' files can be changed.
     root.probe(boot.iter().map(|edit| edit.file.clone()))?;
-    if let Some((side, _)) = &host {
-        side.probe(own.iter().map(|edit| edit.file.clone()))?;
+    if let Some((editor, _)) = &host {
+        editor.probe(own.iter().map(|edit| edit.file.clone()))?;
     }
     if !own.is_empty() || !boot.is_empty() {
         ask(args, computer, moonraker.as_deref(), report, "Take this back?")?;
     }
     let mut told = Vec::new();
-    if let Some((side, target)) = &host {
-        told.extend(side.make(&own)?);
+    if let Some((editor, target)) = &host {
+        told.extend(editor.make(&own)?);
         report.changed.extend(own.iter().map(|edit| edit.file.display().to_string()));
-        side.tidy(&target.folder());
+        editor.tidy(&target.folder());
     }
     told.extend(root.make(&boot)?);
     told.iter().for_each(|line| report.line(line));
@@ -101,7 +101,7 @@ pub(super) fn undo(
         let restarted = Moonraker(&address).restart();
         report.set("warning", json!(restarted.as_ref().err()));
         report.line(match restarted {
-            Ok(()) => "The host has restarted without it.".to_owned(),
+            Ok(()) => "The host has restarted without the device.".to_owned(),
             Err(why) => format!("{why}: run FIRMWARE_RESTART in the host"),
         });
     }
@@ -119,18 +119,18 @@ struct Needs<'a> {
 
 impl Needs<'_> {
     /// The changes of root's files.
-    fn plan(&self, side: &Side, left: &mut Vec<String>) -> Result<Vec<Edit>, String> {
+    fn plan(&self, editor: &Editor, left: &mut Vec<String>) -> Result<Vec<Edit>, String> {
         let mut edits = Vec::new();
         let own = self.device.file(self.name);
         let Some(board) = &self.uses.board else { return Ok(edits) };
-        side.sweep(Path::new(MODULES));
-        if let Some(file) = board.file(side.computer).map(Path::new) {
-            side.sweep(file);
-            let old = side.read(file)?.unwrap_or_default();
+        editor.sweep(Path::new(MODULES));
+        if let Some(file) = board.file(editor.computer).map(Path::new) {
+            editor.sweep(file);
+            let old = editor.read(file)?.unwrap_or_default();
             let mut new = old.clone();
             let keeps = |what: &str, (user, place): &(String, PathBuf), left: &mut Vec<String>| {
                 left.push(format!(
-                    "{} keeps \"{what}\": {user} ({}) needs it. Call this again when it does not",
+                    "{} keeps \"{what}\": {user} ({}) still needs it. Run this command again when it no longer does",
                     file.display(),
                     place.display()
                 ));
@@ -139,7 +139,7 @@ impl Needs<'_> {
                 Boot::ConfigTxt => {
                     if boot::has_changed_lines(&old, &own) {
                         left.push(format!(
-                            "{} keeps lines below \"# pinion add {own}\": they were changed since",
+                            "{} keeps lines below \"# pinion add {own}\": they were changed later",
                             file.display()
                         ));
                     }
@@ -171,7 +171,7 @@ impl Needs<'_> {
                 }
             }
             if new == old {
-                edits.extend(side.needless_copy(file, &old)?);
+                edits.extend(editor.needless_copy(file, &old)?);
             } else {
                 edits.push(Edit { file: file.to_owned(), old: Some(old), new: Some(new) });
             }
@@ -179,7 +179,7 @@ impl Needs<'_> {
         let is_i2c = self.device.way.iter().any(|way| way.bus == Kind::I2c);
         if is_i2c
             && self.others().all(|one| !matches!(one.what, Resource::I2c(..)))
-            && let Some(text) = side.read(Path::new(MODULES))?.filter(|text| text == I2C_DEV)
+            && let Some(text) = editor.read(Path::new(MODULES))?.filter(|text| text == I2C_DEV)
         {
             edits.push(Edit { file: MODULES.into(), old: Some(text), new: None });
         }

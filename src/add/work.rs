@@ -8,10 +8,10 @@ use std::process::{Command, ExitStatus};
 use serde_json::json;
 
 use super::catalog::{Catalog, Device, Wiring, is_line};
+use super::edit::Editor;
 use super::place::{Search, Wire};
 use super::printer::Target;
 use super::report::Report;
-use super::side::Side;
 use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
 use pinion_system::Computer;
 use pinion_system::board::{Board, Slot};
@@ -88,7 +88,7 @@ impl Work<'_> {
             make(
                 self.args,
                 moonraker.as_deref(),
-                &Side::new(self.computer, None),
+                &Editor::new(self.computer, None),
                 &boot,
                 "Change these files?",
                 self.report,
@@ -100,7 +100,7 @@ impl Work<'_> {
                 self.report.set("reboot", json!(true));
                 self.report.line("The bus is there after a reboot. Connect the wires while the power is off:");
                 self.report.line("  sudo poweroff");
-                self.report.line(format_args!("Then call \"{}\" again.", command(self.args, false)));
+                self.report.line(format_args!("Then run \"{}\" again.", command(self.args, false)));
                 return Ok(());
             }
         }
@@ -128,7 +128,7 @@ impl Work<'_> {
         match target {
             Ok(target) => {
                 let own = target.file(&self.device.file(self.name()));
-                Side::new(self.computer, Some(target.owner)).probe(target.files().chain([target.path.clone(), own]))
+                Editor::new(self.computer, Some(target.owner)).probe(target.files().chain([target.path.clone(), own]))
             }
             Err(_) if configs(self.computer).is_empty() => Ok(()),
             Err(why) => Err(why.clone()),
@@ -148,10 +148,10 @@ impl Work<'_> {
         self.report.page.append(&picture::page(board, wires));
         self.report.line("");
         self.report.line(format_args!("  level: {}", board.level));
-        self.report.line(format_args!("  mind:  {}", device.trap));
+        self.report.line(format_args!("  note:  {}", device.trap));
         for one in self.search.uses.unknown() {
             self.report.line(format_args!(
-                "  mind:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
+                "  note:  {}: Pinion does not know which pins the {} takes: compare them with these wires",
                 one.place, one.user
             ));
         }
@@ -161,7 +161,7 @@ impl Work<'_> {
         if let Some(path) = &self.args.picture {
             // Another file has probably a name by mistake.
             if std::fs::read(path).is_ok_and(|bytes| !bytes.starts_with(b"<svg ")) {
-                return Err(format!("{} exists, and is not a picture: name another file", path.display()));
+                return Err(format!("{} exists but is not a picture: name another file", path.display()));
             }
             let svg = picture::svg(board, &device.title, wires);
             Output::check(path, &[])?.write(|out| io::Write::write_all(out, svg.as_bytes()))?;
@@ -177,7 +177,7 @@ impl Work<'_> {
         address: Option<u8>,
         moonraker: Option<&str>,
     ) -> Result<(), String> {
-        let side = Side::new(self.computer, Some(target.owner));
+        let editor = Editor::new(self.computer, Some(target.owner));
         let (mcu, link, is_missing) = target.mcu(self.args.mcu.as_deref())?;
         if self.computer.is_this() && !self.args.dry_run && !serves(self.computer, &link) {
             // Without its MCU, klippy would not start with the new sections.
@@ -191,14 +191,14 @@ impl Work<'_> {
         if let Some(section) = &self.search.there {
             let place = target.config().section(section).map_or(String::new(), |section| section.place.to_string());
             self.report.line(format_args!(
-                "[{section}] is in printer.cfg already ({place}), and stays as it is. For a second one: {} --name NAME",
+                "[{section}] is already in printer.cfg ({place}), and stays as it is. For a second device: {} --name NAME",
                 command(&AddArgs { name: None, ..self.args.clone() }, false)
             ));
         } else {
             let sections = self.sections(target, &mcu, wires, address)?;
-            let edits = target.plan(&side, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
+            let edits = target.plan(&editor, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
             is_changed = !edits.is_empty();
-            make(self.args, moonraker, &side, &edits, "Write this?", self.report)?;
+            make(self.args, moonraker, &editor, &edits, "Write this?", self.report)?;
         }
         if self.args.dry_run {
             self.report.line("Nothing was changed (--dry-run).");
@@ -248,7 +248,7 @@ impl Work<'_> {
         }
         if text.contains("{serial_no}") {
             let serial = self.thermometer(Some(target)).ok_or(
-                "the thermometer's number is not known before it answers: boot the board with it, then call this again",
+                "the thermometer's number is not known before it answers: boot the board with the thermometer, then run this command again",
             )?;
             text = text.replace("{serial_no}", &serial);
         }
@@ -260,7 +260,7 @@ impl Work<'_> {
 fn loaded(modprobe: io::Result<ExitStatus>) -> Result<State, String> {
     match modprobe {
         Ok(status) if status.success() => Ok(State::There),
-        _ => Err("modprobe i2c-dev failed: reboot, then call this again".into()),
+        _ => Err("modprobe i2c-dev failed: reboot, then run this command again".into()),
     }
 }
 

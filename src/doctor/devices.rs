@@ -79,7 +79,7 @@ pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &B
         users.extend(computer.caller().map(|caller| (caller, Vec::new())));
     }
     if users.is_empty() {
-        let found = "there is no user pinion: the service is not installed, and what it may open is unknown";
+        let found = "there is no user pinion: the service is not installed, so what it may open is unknown";
         return vec![Finding::warning("user", found, INSTALL)];
     }
     users.iter().flat_map(|(user, instances)| permissions_of(computer, instances, user, ports)).collect()
@@ -89,7 +89,7 @@ pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &B
 fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, ports: &BTreeSet<String>) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
-        [] => "log in anew, and start Pinion anew".to_owned(),
+        [] => "log in again, then restart Pinion".to_owned(),
         units => format!("sudo systemctl restart {}", units.iter().map(word).collect::<Vec<_>>().join(" ")),
     };
     let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
@@ -106,7 +106,7 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     let wants = |wish| instances.iter().any(|instance| instance.settings.fast_gpio == wish);
     if wants(FastGpio::On) {
         findings.push(permission(&FAST).unwrap_or_else(|| {
-            let found = "fast lines: fast_gpio is on, and there is no /dev/gpiomem: lines go through the kernel";
+            let found = "fast lines: fast_gpio is on, but there is no /dev/gpiomem: lines go through the kernel";
             let remedy = "only Raspberry Pi's own kernel has this node: install it, or set fast_gpio to auto";
             Finding::warning("fast_gpio", found, remedy)
         }));
@@ -189,7 +189,7 @@ fn present(computer: &Computer, config_txt: &ConfigTxt, class: &Class) -> Findin
     }
     if check == "i2c" && !computer.matching("/sys/bus/i2c/devices/i2c-*").is_empty() {
         let remedy = "echo i2c-dev | sudo tee /etc/modules-load.d/i2c-dev.conf && sudo modprobe i2c-dev";
-        return Finding::warning(check, "I2C: there are buses, and no /dev/i2c-*: i2c-dev is not loaded", remedy);
+        return Finding::warning(check, "I2C: there are buses, but no /dev/i2c-*: i2c-dev is not loaded", remedy);
     }
     let off = format!("{name}: none");
     let Some((line, beginning)) = class.enabled_by else {
@@ -201,10 +201,10 @@ fn present(computer: &Computer, config_txt: &ConfigTxt, class: &Class) -> Findin
     match config_txt.enables(beginning) {
         true if check == "w1" => Finding::warning(
             check,
-            "1-Wire: on, and no DS18B20 answers",
+            "1-Wire: on, but no DS18B20 answers",
             "check its wires and the pull-up resistor (4.7 kOhm)",
         ),
-        true => Finding::warning(check, format!("{name}: on in {config}, and not there"), "sudo reboot"),
+        true => Finding::warning(check, format!("{name}: on in {config}, but not there"), "sudo reboot"),
         false => Finding::ok(check, format!("{name}: off"))
             .or(format!("if it is wanted: {}, and reboot", append(computer, line))),
     }
@@ -384,7 +384,7 @@ mod tests {
         let findings = present(&tree);
         let remedy = says(&findings, "spi", Fine, "SPI: off");
         assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
-        assert_eq!(says(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
+        assert_eq!(says(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, but not there"), "sudo reboot");
         says(&findings, "w1", Warning, "no DS18B20 answers");
         assert!(says(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
         tree.put("sys/bus/i2c/devices/i2c-1/name", "");
@@ -415,7 +415,7 @@ mod tests {
             tree.put("boot/firmware/more.txt", "dtparam=spi=on\n");
             let findings = present(&tree);
             match is_on {
-                true => drop(says(&findings, "spi", Warning, "on in /boot/firmware/config.txt, and not there")),
+                true => drop(says(&findings, "spi", Warning, "on in /boot/firmware/config.txt, but not there")),
                 false => drop(says(&findings, "spi", Fine, "SPI: off")),
             }
         }

@@ -41,7 +41,7 @@ pub(super) fn of_all<T: Ord>(klippys: &[Klippy], kind: fn(&Printer) -> BTreeSet<
 /// Whether Pinion speaks the messages of each host.
 pub(super) fn dialects(computer: &Computer, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     if klippys.is_empty() {
-        let found = "which host comes is unknown: no klippy runs, and no unit starts one";
+        let found = "the host is unknown: no klippy runs, and no unit starts a klippy";
         return vec![Finding::ok(DIALECT, found).or("pinion doctor --klipper DIR looks at a checkout")];
     }
     klippys.iter().flat_map(|klippy| dialect(computer, instances, klippy)).collect()
@@ -57,7 +57,7 @@ pub(super) fn strangers(computer: &Computer) -> Option<Finding> {
     let more = strangers.len().checked_sub(SHOWN).filter(|more| *more > 0);
     let more = more.map_or(String::new(), |more| format!(" and {more} more"));
     let found = format!(
-        "other users have processes with the names of a Pinion or a klippy, which do not count here: {}{more}",
+        "processes of other users are called like a Pinion or a klippy, and do not count here: {}{more}",
         pids.join(", ")
     );
     (!strangers.is_empty())
@@ -69,7 +69,7 @@ const DIALECT: &str = "dialect";
 fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<Finding> {
     let Klippy { folder, found_by, .. } = klippy;
     let Some(folder) = folder else {
-        let found = format!("klippy's sources ({found_by}) are not known: its folder may not be looked into");
+        let found = format!("klippy's sources ({found_by}) are unknown: this user may not read klippy's folder");
         return vec![Finding::warning(DIALECT, found, "sudo pinion doctor")];
     };
     let shown = computer.name(folder);
@@ -111,7 +111,7 @@ fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<
         findings.push(Finding::error(
             DIALECT,
             format!(
-                "the host is newer than Pinion, which does not have these messages{}: {}",
+                "the host is newer than Pinion: Pinion does not have these messages{}: {}",
                 klipper::for_parts(&missing),
                 host::names(&missing)
             ),
@@ -138,7 +138,7 @@ mod tests {
             let computer = tree.computer();
             dialects(&computer, &instances(&computer).0, &klippys(&computer))
         };
-        says(&look(), "dialect", Ok, "which host comes is unknown");
+        says(&look(), "dialect", Ok, "the host is unknown");
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
         says(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");

@@ -24,8 +24,7 @@ fn version(computer: &Computer) -> Finding {
     let lacks = |version| is_before(&release, version);
     match () {
         () if lacks(OLDEST) => {
-            let found =
-                format!("Linux {release} is too old: {}.{} is the oldest that Pinion runs on", OLDEST.0, OLDEST.1);
+            let found = format!("Linux {release} is too old: Pinion needs {}.{} or later", OLDEST.0, OLDEST.1);
             Finding::error(CHECK, found, REMEDY)
         }
         () if lacks(BIAS_SINCE) => Finding::warning(
@@ -40,7 +39,7 @@ fn version(computer: &Computer) -> Finding {
             Finding::warning(CHECK, found, REMEDY)
         }
         () if release.is_empty() => Finding::ok(CHECK, "the kernel's version is unknown"),
-        () => Finding::ok(CHECK, format!("Linux {release} has all that Pinion asks of it")),
+        () => Finding::ok(CHECK, format!("Linux {release} has all that Pinion needs")),
     }
 }
 
@@ -83,7 +82,7 @@ fn throttle(computer: &Computer) -> Finding {
         -1 => Finding::ok(CHECK, "the kernel does not throttle real time"),
         0 => Finding::error(CHECK, "the kernel permits no real time: kernel.sched_rt_runtime_us is 0", REMEDY),
         runtime if runtime < period / 2 => Finding::warning(CHECK, found, REMEDY),
-        _ => Finding::ok(CHECK, format!("{found}: Pinion stays clear of it")),
+        _ => Finding::ok(CHECK, format!("{found}: Pinion stays below that")),
     }
 }
 
@@ -107,13 +106,13 @@ fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
                 let present = present.as_deref().unwrap_or_default();
                 Finding::error(
                     CHECK,
-                    format!("{name} is to stay on processor {cpu}, which is not there: this computer has {present}"),
+                    format!("{name} is configured for processor {cpu}, but this computer has {present}"),
                     format!("cpu = {} in {config}", last(present)),
                 )
             }
             _ if taken.contains(&cpu) => Finding::warning(
                 CHECK,
-                format!("{name} stays on processor {cpu}, as another Pinion does: each keeps the other waiting"),
+                format!("{name} stays on processor {cpu}, like another Pinion: each delays the other"),
                 format!("another cpu in {config}"),
             ),
             "" => Finding::warning(
@@ -126,7 +125,7 @@ fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
             }
             isolated => Finding::warning(
                 CHECK,
-                format!("{name} stays on processor {cpu}, and others are isolated: {isolated}"),
+                format!("{name} stays on processor {cpu}, but other processors are isolated: {isolated}"),
                 format!("cpu = {} in {config}", first(isolated)),
             ),
         });
@@ -134,10 +133,10 @@ fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     }
     if findings.is_empty() {
         findings.push(match isolated.as_str() {
-            "" => Finding::ok(CHECK, "no processor is isolated, and Pinion takes any"),
+            "" => Finding::ok(CHECK, "no processor is isolated, and Pinion runs on any"),
             isolated => Finding::warning(
                 CHECK,
-                format!("isolated: {isolated}, which nobody uses: Pinion is not configured to"),
+                format!("isolated: {isolated}, but unused: Pinion is not configured to use them"),
                 format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
             ),
         });
@@ -231,11 +230,11 @@ mod tests {
         let rt = says(&found(&tree, None), "preempt_rt", Warning, "6.12.25+rpt-rpi-v7 is not PREEMPT_RT");
         assert!(rt.starts_with("install a 64-bit Raspberry Pi OS"), "{rt}");
         says(&findings, "rt_throttling", Error, "no real time");
-        assert_eq!(says(&findings, "isolated_cpus", Warning, "nobody uses"), "cpu = 3 in /etc/pinion/pinion.toml");
+        assert_eq!(says(&findings, "isolated_cpus", Warning, "but unused"), "cpu = 3 in /etc/pinion/pinion.toml");
         says(&findings, "governor", Warning, "is ondemand:");
         tree.put("proc/sys/kernel/sched_rt_runtime_us", "100000\n");
         says(&found(&tree, Some(2)), "rt_throttling", Warning, "100000 of 1000000");
-        says(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
+        says(&found(&tree, Some(2)), "isolated_cpus", Warning, "but other processors are isolated: 3");
         tree.put("sys/devices/system/cpu/isolated", "\n");
         assert!(says(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
         tree.put("sys/devices/system/cpu/present", "0-3\n");
@@ -243,7 +242,7 @@ mod tests {
         // A processor that is not there cannot be isolated either.
         for isolated in ["", "99", "2-3"] {
             tree.put("sys/devices/system/cpu/isolated", isolated);
-            let remedy = says(&found(&tree, Some(99)), "isolated_cpus", Error, "99, which is not there");
+            let remedy = says(&found(&tree, Some(99)), "isolated_cpus", Error, "processor 99, but this computer has");
             assert_eq!(remedy, "cpu = 3 in /etc/pinion/pinion.toml");
         }
     }
@@ -264,14 +263,14 @@ mod tests {
         says(&findings, "isolated_cpus", Ok, "process 10 stays on processor 2");
         says(&findings, "isolated_cpus", Ok, "process 11 stays on processor 3");
         tree.process(11, &["/usr/bin/pinion", "run", "--cpu", "2", "-I", "/tmp/klipper_host_11"], 0, &[]);
-        says(&found(&tree, None), "isolated_cpus", Warning, "process 11 stays on processor 2, as another Pinion does");
+        says(&found(&tree, None), "isolated_cpus", Warning, "process 11 stays on processor 2, like another Pinion");
     }
 
     #[test]
     fn kernels_that_are_too_old_for_some_or_for_all() {
         let tree = Tree::empty();
         for (release, status, words) in [
-            ("4.9.337-h616", Error, "4.13 is the oldest"),
+            ("4.9.337-h616", Error, "needs 4.13 or later"),
             ("4.13.0", Warning, "pull-up"),
             ("5.4.83-v7l+", Warning, "pull-up"),
             ("5.5.0", Warning, "tachometers are polled"),

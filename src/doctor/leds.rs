@@ -39,7 +39,7 @@ pub(super) fn leds(computer: &Computer, config_txt: &ConfigTxt, pins: &BTreeSet<
     };
     let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
     let bus = without_dma.map(|pin| {
-        let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses amid a frame");
+        let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses within a frame");
         Finding::warning(CHECK, found, TO_SPI)
     });
     [Some(clock), bus].into_iter().flatten().collect()
@@ -89,10 +89,7 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
         let why = format!("{} may not open {}", user.name, node.display());
         return refused(&why, set("on") + ": pinion doctor then names the missing permission");
     }
-    Finding::ok(
-        CHECK,
-        format!("LEDs: {pin} is on a fast line, if it is one of the processor's own ({})", node.display()),
-    )
+    Finding::ok(CHECK, format!("LEDs: {pin} is on a fast line, if it is a GPIO of the processor ({})", node.display()))
 }
 
 #[cfg(test)]

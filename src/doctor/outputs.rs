@@ -27,7 +27,7 @@ fn released_by(computer: &Computer, parameter: &Path) -> Option<Finding> {
     }
     let keeps = ["Y", "1"].contains(&&*computer.text(parameter)?);
     if !keeps {
-        let found = "the kernel makes an output an input when nobody holds it any more: its resistor decides the level";
+        let found = "the kernel makes an output an input when no program holds it any longer: its resistor then decides the level";
         return Some(Finding::ok(CHECK, found));
     }
     Some(Finding::warning(

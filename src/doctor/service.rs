@@ -39,7 +39,7 @@ fn state(computer: &Computer, instance: &Instance) -> Finding {
     const CHECK: &str = "service";
     let runs = |pid: u32| format!("Pinion runs as process {pid}");
     let Some(unit) = &instance.unit else {
-        let by_hand = "no service has started it, and none starts it at boot";
+        let by_hand = "no service has started it, and no service starts it at boot";
         return Finding::ok(CHECK, format!("{}: {by_hand}", runs(instance.pid.unwrap_or_default())));
     };
     let is_enabled = !units::enabled(computer, |name| name == unit).is_empty();
@@ -49,11 +49,11 @@ fn state(computer: &Computer, instance: &Instance) -> Finding {
     match (instance.pid, is_enabled) {
         (Some(pid), true) => Finding::ok(CHECK, format!("{} ({unit})", runs(pid))),
         (Some(pid), false) => {
-            Finding::ok(CHECK, format!("{} ({unit}), and is not started at boot", runs(pid))).or(enable)
+            Finding::ok(CHECK, format!("{} ({unit}), but does not start at boot", runs(pid))).or(enable)
         }
         (None, true) => Finding::error(
             CHECK,
-            format!("Pinion does not run, though its service is enabled ({unit})"),
+            format!("Pinion does not run, although its service is enabled ({unit})"),
             format!("sudo systemctl restart {word}; journalctl -u {word} says why it ended"),
         ),
         (None, false) if is_installed => Finding::warning(CHECK, "Pinion does not run", enable),
@@ -67,7 +67,7 @@ fn former(computer: &Computer, instance: &Instance) -> Option<Finding> {
     let program = fs::read_link(computer.path(format!("/proc/{pid}/exe"))).ok()?;
     // The kernel's words for a file that another one has replaced.
     program.to_str()?.strip_suffix(" (deleted)")?;
-    let found = format!("an update has replaced the program of process {pid}, which goes on: a restart is due");
+    let found = format!("an update has replaced the program of process {pid}, which still runs: a restart is due");
     Some(Finding::warning("version", found, format!("when no print runs: {}", instance.restart())))
 }
 
@@ -118,7 +118,7 @@ fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
         _ => Finding::warning(
             CHECK,
             format!("Pinion (process {pid}) does not run in real time: it is not permitted"),
-            format!("use the service; its log says what keeps it from that{log}"),
+            format!("use the service; its log says what prevents real time{log}"),
         ),
     })
 }
@@ -134,7 +134,7 @@ fn no_real_time(computer: &Computer, pid: u32) -> Option<(&'static str, String)>
         controllers.split(',').any(|controller| controller == "cpu") && share.is_some_and(|share| share == "0")
     });
     if has_none {
-        let why = "the kernel (RT_GROUP_SCHED) gives its control group no share of it";
+        let why = "the kernel (RT_GROUP_SCHED) gives its control group no share of real time";
         return Some((
             why,
             "sudo sysctl kernel.sched_rt_runtime_us=-1, or boot a kernel without RT_GROUP_SCHED".into(),
@@ -143,7 +143,7 @@ fn no_real_time(computer: &Computer, pid: u32) -> Option<(&'static str, String)>
     let marks = ["/.dockerenv", "/run/.containerenv", "/run/systemd/container"];
     let is_container = marks.iter().any(|file| computer.exists(file));
     is_container.then(|| {
-        let why = "the container has no right to it";
+        let why = "the container has no right to real time";
         (why, "start the container with --cap-add=sys_nice --ulimit rtprio=99".into())
     })
 }
@@ -154,7 +154,7 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const STOP: &str = "sudo systemctl disable --now klipper-mcu";
     const SCRIPT: &str = "/etc/init.d/klipper_mcu";
     // Klipper's scripts/flash-linux.sh starts whatever it finds, enabled or not.
-    const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, which stops Pinion, while printing, too";
+    const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, and that stops Pinion, even during a print";
     let mut findings = Vec::new();
     let is_it = |name: &std::ffi::OsStr| name == "klipper_mcu";
     let process = computer.processes(|process| process.program().is_some_and(is_it)).next();
@@ -168,7 +168,7 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     if !enabled.is_empty() {
         let names: Vec<String> = enabled.iter().map(|unit| format!("{unit}.service")).collect();
         let (is, it) = if let [_] = names[..] { ("is", "it is") } else { ("are", "they are") };
-        let found = format!("{} {is} enabled: at boot {it} started beside Pinion, and stop it", names.join(" and "));
+        let found = format!("{} {is} enabled: {it} started at boot, which stops Pinion", names.join(" and "));
         findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {}", names.join(" "))));
     } else if is_pinion_enabled
         && let Some((unit, file)) = units::all(computer).into_iter().find_map(|unit| {
@@ -210,18 +210,17 @@ pub(super) fn watchdog(computer: &Computer, instances: &[Instance], systemctl: O
     let feeding: Vec<&Instance> = instances.iter().filter(|instance| instance.settings.watchdog).collect();
     if feeding.is_empty() {
         let found = "Pinion does not feed the hardware watchdog";
-        let finding =
-            Finding::ok(CHECK, if is_there { found } else { "Pinion feeds no hardware watchdog, and there is none" });
-        let wanted = "if a computer that hangs is to be reset: watchdog = true in /etc/pinion/pinion.toml";
+        let finding = Finding::ok(CHECK, if is_there { found } else { "there is no hardware watchdog to feed" });
+        let wanted = "to reset a computer that hangs: watchdog = true in /etc/pinion/pinion.toml";
         return vec![if is_there { finding.or(wanted) } else { finding }];
     }
     if !is_there {
-        let found = format!("there is no {WATCHDOG}, which Pinion is to feed");
+        let found = format!("Pinion is configured to feed {WATCHDOG}, but there is none");
         return vec![Finding::error(CHECK, found, WATCHDOG_REMEDY)];
     }
     if let [first, second, ..] = feeding[..] {
         let found = format!(
-            "{} and {} are both configured to feed {WATCHDOG}, and only one program can",
+            "{} and {} are both configured to feed {WATCHDOG}, but only one program can",
             first.name(),
             second.name()
         );
@@ -256,7 +255,7 @@ mod tests {
         tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
         tree.put("proc/10/cgroup", "0::/system.slice/pinion-mcu.service\n");
         assert_eq!(
-            says(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu), and is not started at boot"),
+            says(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu), but does not start at boot"),
             "sudo systemctl enable --now pinion-mcu"
         );
         tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/usr/lib/systemd/system/x");
@@ -268,7 +267,7 @@ mod tests {
         fs::remove_dir_all(tree.computer().path("/proc/10")).unwrap();
         tree.process(9, &["pinion", "doctor"], 0, &[]);
         let findings = found(&tree);
-        says(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
+        says(&findings, "service", Error, "does not run, although its service is enabled (pinion-mcu)");
         assert_eq!(findings.iter().filter(|finding| finding.check == "service").count(), 1);
     }
 
@@ -286,7 +285,7 @@ mod tests {
         };
         assert!(!is_due("/usr/bin/pinion"));
         assert!(is_due("/usr/bin/pinion (deleted)"));
-        let remedy = says(&found(&tree), "version", Warning, "process 10, which goes on: a restart is due");
+        let remedy = says(&found(&tree), "version", Warning, "process 10, which still runs: a restart is due");
         assert_eq!(remedy, "when no print runs: sudo systemctl restart pinion-mcu");
     }
 
@@ -390,9 +389,9 @@ mod tests {
     fn a_watchdog_that_is_fed() {
         let tree = Tree::empty();
         let look = || watchdog(&tree.computer(), &instances(&tree.computer()).0, None);
-        says(&look(), "watchdog_device", Ok, "there is none");
+        says(&look(), "watchdog_device", Ok, "there is no hardware watchdog to feed");
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
-        says(&look(), "watchdog_device", Error, "there is no /dev/watchdog");
+        says(&look(), "watchdog_device", Error, "to feed /dev/watchdog, but there is none");
         tree.put("dev/watchdog", "");
         says(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/pinion/pinion.toml", "watchdog = false\n");

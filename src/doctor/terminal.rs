@@ -30,15 +30,14 @@ pub(super) fn terminals(computer: &Computer, instances: &[Instance], klippys: &[
             continue;
         }
         let Some(link) = &instance.link else {
-            let found =
-                format!("{} is no path that klippy takes for a pseudo terminal's", instance.settings.symlink.display());
-            findings
-                .push(Finding::ok(CHECK, found).or(format!("if klippy is to open it: pinion run -I {HOST_PATHS}NAME")));
+            let found = format!("klippy does not take {} for a pseudo terminal", instance.settings.symlink.display());
+            findings.push(Finding::ok(CHECK, found).or(format!("for klippy: pinion run -I {HOST_PATHS}NAME")));
             continue;
         };
         if links.contains(&link.as_path()) {
-            let found = format!("{} wants the link {}, too, which another Pinion has", instance.name(), link.display());
-            findings.push(Finding::error(CHECK, found, "stop one of the two, or give it a link of its own with -I"));
+            let found =
+                format!("{} is configured for the link {}, but another Pinion has it", instance.name(), link.display());
+            findings.push(Finding::error(CHECK, found, "stop one, or give one of them another link with -I"));
             continue;
         }
         links.push(link);
@@ -80,7 +79,7 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
     let pid = instance.and_then(|instance| instance.pid);
     let Ok(way) = computer.follow(path) else {
         let target = fs::read_link(computer.path(path)).unwrap_or_default();
-        let found = format!("{shown} leads to {}, which is not there", target.display());
+        let found = format!("{shown} leads to {}, which does not exist", target.display());
         return vec![match pid {
             None => Finding::warning(CHECK, found, format!("sudo systemctl start {}", word(unit_for(path)))),
             Some(_) => Finding::error(CHECK, found, restart),
@@ -98,7 +97,7 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
     let leads = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));
     if opening.is_empty() {
         let unknown = match klippys {
-            [] => Finding::ok(CHECK, "who klippy is, is unknown: none runs, and no unit starts one"),
+            [] => Finding::ok(CHECK, "klippy's user is unknown: no klippy runs, and no unit starts a klippy"),
             _ => Finding::ok(CHECK, format!("no klippy's configuration names {shown}"))
                 .or(format!("in printer.cfg: [mcu host] and below it serial: {shown}")),
         };
@@ -113,15 +112,15 @@ fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klipp
 fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Finding {
     let shown = path.display();
     match instance.map(|instance| (instance, instance.pid)) {
-        Some((_, None)) => Finding::ok(CHECK, format!("{shown} is not there, as Pinion does not run")),
+        Some((_, None)) => Finding::ok(CHECK, format!("{shown} does not exist, because Pinion does not run")),
         Some((instance, Some(pid))) => Finding::error(
             CHECK,
-            format!("there is no {shown}, which klippy opens, though Pinion runs (process {pid})"),
+            format!("klippy opens {shown}, which does not exist, although Pinion runs (process {pid})"),
             format!("{}, or pinion run -I {shown}", instance.restart()),
         ),
         None => {
             let found =
-                format!("there is no {shown}, which klippy's configuration names{}: no Pinion has it", by(opening));
+                format!("klippy's configuration names {shown}{}, which does not exist: no Pinion has it", by(opening));
             match opening.iter().any(|klippy| klippy.unit.is_some()) {
                 true => {
                     let remedy = format!(
@@ -140,7 +139,7 @@ fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Fin
 fn wanted_by_several(path: &Path, opening: &[&Klippy]) -> Option<Finding> {
     let sure: Vec<&Klippy> = opening.iter().copied().filter(|klippy| klippy.printer().is_some()).collect();
     let shown = path.display();
-    let found = format!("more than one klippy's configuration names {shown}{}, and one can have it", by(&sure));
+    let found = format!("several klippys' configurations name {shown}{}, but only one klippy can open it", by(&sure));
     let remedy = "another serial for one of them: an instance of its own (man pinion-mcu.service)";
     (sure.len() > 1).then(|| Finding::error(CHECK, found, remedy))
 }
@@ -180,7 +179,7 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
     let (name, leads) = (&who.name, format!("{leads}, for klippy's user {} ({found_by})", who.name));
     if let Some(owner) = link_is_refused(computer, path, link, who) {
         let shown = path.display();
-        let found = format!("the kernel lets {name} not follow {shown}, a link of {owner}'s (fs.protected_symlinks)");
+        let found = format!("{name} may not follow {shown}, a link of user {owner} (fs.protected_symlinks)");
         let remedy = format!("use the service, or run Pinion as {name}");
         return Finding::error(CHECK, found, remedy);
     }
@@ -201,9 +200,9 @@ fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instan
         (Some(instance), group) if group.is_none() || !Access::READ_WRITE.is_given_to_group(about) => {
             format!("mode = \"0660\" and group = \"tty\" in {}, then {}", instance.config(), instance.restart())
         }
-        (None, None) => format!("have what serves {} give it to the group tty", path.display()),
+        (None, None) => format!("let the program that serves {} give it to the group tty", path.display()),
         _ if is_member && *is_running => {
-            format!("{}, as the user was made a member after it was started", klippy.restart())
+            format!("{}, because the user became a member after it was started", klippy.restart())
         }
         (_, group) => {
             format!("sudo usermod -aG {} {} && {}", word(group.unwrap_or_default()), word(name), klippy.restart())
@@ -263,7 +262,7 @@ mod tests {
         let (tree, gid) = with_terminal(0o660);
         let findings = looked(&tree);
         says(&findings, "terminal", Ok, "leads to /dev/pts/3");
-        says(&findings, "terminal", Ok, "who klippy is, is unknown");
+        says(&findings, "terminal", Ok, "klippy's user is unknown");
         tree.process(8, &KLIPPY, PI, &[gid]);
         says(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
         tree.process(8, &KLIPPY, PI, &[]);
@@ -310,14 +309,14 @@ mod tests {
     #[test]
     fn a_link_that_is_none_or_leads_nowhere() {
         let tree = Tree::empty();
-        says(&looked(&tree), "terminal", Ok, "as Pinion does not run");
+        says(&looked(&tree), "terminal", Ok, "because Pinion does not run");
         tree.process(10, &["/usr/bin/pinion", "run"], 0, &[]);
-        says(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_mcu");
+        says(&looked(&tree), "terminal", Error, "klippy opens /tmp/klipper_host_mcu, which does not exist");
         tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
-        says(&looked(&tree), "terminal", Error, "which is not there");
+        says(&looked(&tree), "terminal", Error, "which does not exist");
         let tree = Tree::empty();
         tree.link("tmp/klipper_host_mcu", "klipper_host_mcu");
-        says(&looked(&tree), "terminal", Warning, "which is not there");
+        says(&looked(&tree), "terminal", Warning, "which does not exist");
         let tree = Tree::empty();
         tree.put("tmp/klipper_host_mcu/file", "");
         let remedy = says(&looked(&tree), "terminal", Error, "/tmp/klipper_host_mcu is a folder");
@@ -389,12 +388,17 @@ mod tests {
         let (tree, _) = two_printers();
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
         let findings = looked(&tree);
-        says(&findings, "terminal", Error, "names /tmp/klipper_host_mcu (process 21, process 22), and one can have it");
+        says(
+            &findings,
+            "terminal",
+            Error,
+            "name /tmp/klipper_host_mcu (process 21, process 22), but only one klippy can open it",
+        );
         assert!(
             says(&findings, "terminal", Ok, "no klippy's configuration names /tmp/klipper_host_b").contains("serial: ")
         );
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
-        let remedy = says(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_c, which klippy's");
+        let remedy = says(&looked(&tree), "terminal", Error, "klippy's configuration names /tmp/klipper_host_c");
         assert!(remedy.starts_with("sudo systemctl enable --now pinion-mcu@c"), "{remedy}");
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /run/pinion/klipper_host_b\n");
         let remedy = says(&looked(&tree), "terminal", Error, "names /run/pinion/klipper_host_b, which it takes");
@@ -404,9 +408,9 @@ mod tests {
         assert!(!format!("{:?}", looked(&tree)).contains("klipper_host_c"), "a stranger's klippy");
         let script = "/home/other/klipper/klippy/klippy.py";
         tree.process(22, &["/usr/bin/python3", script, "/home/other/printer.cfg"], PI, &[]);
-        let remedy = says(&looked(&tree), "terminal", Warning, "there is no /tmp/klipper_host_c, which klippy's");
+        let remedy = says(&looked(&tree), "terminal", Warning, "klippy's configuration names /tmp/klipper_host_c");
         assert!(!remedy.contains("sudo"), "{remedy}");
         tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 0, &[]);
-        says(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
+        says(&looked(&tree), "terminal", Error, "process 13 is configured for the link /tmp/klipper_host_b, but");
     }
 }

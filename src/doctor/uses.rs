@@ -61,7 +61,7 @@ pub(super) fn conflicts(uses: &Uses) -> Vec<Finding> {
                         "if that pin is the chip select: cs_pin: {mcu}:None and spi_bus: spidev{bus}.0 in printer.cfg; otherwise another pin (pinion pins --used)"
                     )
                 }
-                None => "another pin for one of them: pinion pins --used shows which are used".into(),
+                None => "choose another pin for one of them: pinion pins --used shows the used pins".into(),
             };
             findings.push(Finding::error(CHECK, found, remedy));
         }

@@ -56,7 +56,7 @@ pub(crate) fn fetch(paths: &[PathBuf], link: &Path, bytes_max: usize) -> Result<
             }
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 return Err(format!(
-                    "{} is asked by too many at once: end the programs that ask it all the time (sudo ss -xp names them)",
+                    "too many programs ask {} for its status at once: end some of them (sudo ss -xp names them)",
                     path.display()
                 ));
             }
@@ -96,7 +96,9 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
             Ok(Sender { version }) => format!(
                 "{path}: pinion {own} cannot read the status of Pinion {version}: {error}: use the pinion of that version"
             ),
-            Err(_) => format!("{path}: the answer is no status: {error}: is it a Pinion? (--socket)"),
+            Err(_) => {
+                format!("{path}: the answer is not a status: {error}: is it a Pinion? (--socket)")
+            }
         }),
     }
 }
@@ -118,7 +120,7 @@ fn document_at(path: &Path, bytes_max: usize) -> io::Result<Vec<u8>> {
         match socket.read(&mut piece) {
             Ok(0) => return Ok(document),
             Ok(read) if document.len() + read <= bytes_max => document.extend_from_slice(&piece[..read]),
-            Ok(_) => return Err(io::Error::other("what it says has no end")),
+            Ok(_) => return Err(io::Error::other("the answer is too long")),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 let left = until.saturating_duration_since(Instant::now());
                 if left.is_zero() {
@@ -160,6 +162,6 @@ mod tests {
             "{error}"
         );
         let error = answered(&json!({ "HTTP": 1.1 })).map(|_| ()).unwrap_err();
-        assert!(error.starts_with("/run/pinion/mcu.sock: the answer is no status: "), "{error}");
+        assert!(error.starts_with("/run/pinion/mcu.sock: the answer is not a status: "), "{error}");
     }
 }

@@ -24,7 +24,7 @@ pub(super) fn page(status: &Status) -> Page {
     row("host", host(&status.host, mcu));
     row(
         "guardian",
-        status.guardian.pid.map_or("none, as this board needs none".into(), |pid| format!("process {pid}")),
+        status.guardian.pid.map_or("none, because this board needs none".into(), |pid| format!("process {pid}")),
     );
     if let Some(RecorderStatus { bytes, folder }) = &status.recorder {
         let memory = format!("up to {:.1} MB for the last ten seconds", *bytes as f64 / 1e6);
@@ -105,7 +105,7 @@ fn line(line: &Line) -> Vec<String> {
     let level = match line.level {
         Some(0) => "low",
         Some(_) => "high",
-        None => "not looked at yet",
+        None => "not read yet",
     };
     let way = line.bus.map(transfers).or(line.fast.then(|| "fast".to_owned())).unwrap_or_default();
     vec![line.pin.clone(), line.use_.name().into(), level.into(), way]
@@ -155,7 +155,7 @@ mod tests {
             "timers    10 run, late by p50 1.0 us, p99 2.0 us, p99.9 3.0 us, at most 4.0 us; the core wakes 50.0 us early",
             "queues    moves 3 of 1024, commands 0, spi0 1",
             "lines     gpio\"1  output  high",
-            "          gpio2   input   not looked at yet  7 transfers, 3 failed, 2 of them tried again",
+            "          gpio2   input   not read yet  7 transfers, 3 failed, 2 of them tried again",
             "objects   oid 0  SPI device  gpio8  9 transfers, 2 failed, 1 of them tried again",
             "          oid 1  stepper     gpio9  at -5 steps, 3 queued",
         ] {

@@ -35,7 +35,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
     let signals: Vec<i32> = [SIGINT, SIGQUIT, SIGTERM].into_iter().chain(hang_up).collect();
     for signal in &signals {
         signal_hook::flag::register(*signal, ended.clone())
-            .map_err(|error| format!("signals cannot be taken in: {error}"))?;
+            .map_err(|error| format!("signals cannot be received: {error}"))?;
     }
     give_back_at(&signals, GRACE)?;
     // If the instance does not answer at first, the command was a mistake. Later the instance may be restarting.

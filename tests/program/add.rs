@@ -352,7 +352,7 @@ fn programs_get_the_same_as_json() {
     // Nobody can be asked.
     let output = card.add(&["relay", "--json"]);
     let value: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert!(value["error"].as_str().unwrap().contains("call it with --yes"));
+    assert!(value["error"].as_str().unwrap().contains("use --yes"));
     assert_eq!(output.status.code(), Some(1));
 }
 
@@ -567,7 +567,7 @@ fn a_bus_that_a_section_of_the_user_needs_stays() {
     let printer_cfg = card.read(PRINTER);
     card.put(PRINTER, &format!("{printer_cfg}\n[lis2dw bed]\ncs_pin: host:None\nspi_bus: spidev0.1\n"));
     let printed = card.added(&["adxl345", "--undo", "--yes"]);
-    let keeps = format!("/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] (/{PRINTER}) needs it");
+    let keeps = format!("/boot/firmware/config.txt keeps \"dtparam=spi=on\": [lis2dw bed] (/{PRINTER}) still needs it");
     assert!(printed.contains(&keeps), "{printed}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
     card.put(PRINTER, PRINTER_CFG);
@@ -582,7 +582,7 @@ fn a_printer_cfg_that_may_not_be_changed_stays() {
     let log = card.refused(&["relay", "--yes"]);
     let file = card.path(PRINTER);
     assert!(
-        log.contains(&format!("/{PRINTER} is read-only: chmod u+w {}, then call this again", file.display())),
+        log.contains(&format!("/{PRINTER} is read-only: chmod u+w {}, then run this command again", file.display())),
         "{log}"
     );
     assert_eq!(card.read(PRINTER), PRINTER_CFG);
@@ -783,7 +783,7 @@ fn a_fan_turns_until_its_tachometer_counts_and_leds_light() {
     let printed = card.added(&["ws2812", "--yes", "--moonraker", &address]);
     assert!(printed.contains("the strip should be red now"), "{printed}");
     let printed = card.added(&["fan", "--undo", "--yes", "--moonraker", &address]);
-    assert!(printed.contains("The host has restarted without it."), "{printed}");
+    assert!(printed.contains("The host has restarted without the device."), "{printed}");
     let requests = end(&address, server);
     let scripts: Vec<&str> = requests
         .iter()
@@ -824,7 +824,7 @@ fn a_file_that_is_the_user_s_stays() {
     assert_eq!(card.snapshot(), before);
     let printed = card.added(&["adxl345", "--yes"]);
     assert!(
-        printed.contains(&format!("[adxl345] is in printer.cfg already (/{PRINTER}:16), and stays as it is.")),
+        printed.contains(&format!("[adxl345] is already in printer.cfg (/{PRINTER}:16), and stays as it is.")),
         "{printed}"
     );
     assert!(!Path::new(&card.path(&PRINTER.replace("printer.cfg", "pinion/adxl345.cfg"))).exists());

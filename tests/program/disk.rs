@@ -162,7 +162,7 @@ fn a_log_on_a_full_disk_keeps_no_host_out() {
 #[test]
 fn a_configuration_that_a_power_cut_has_damaged_is_refused_with_its_remedy() {
     for (damaged, line) in [
-        ("\0".repeat(300), ":1:1: there are zero bytes, as a power cut leaves them: write the file anew"),
+        ("\0".repeat(300), ":1:1: there are zero bytes, as a power cut leaves them: write the file again"),
         (format!("board = \"sim\"\n{}", "\0".repeat(9)), ":2:1: there are zero bytes"),
         ("board = \"sim\"\nreal".to_owned(), ": write a key, = and its value, such as realtime = true"),
         ("board = \"si".to_owned(), ": board: write it such as board = \"linux\""),

@@ -207,7 +207,7 @@ fn each_instance_and_each_klippy_is_judged() {
     for line in [
         "  error    /etc/pinion/second.toml:1:1: watchdogg: there is no such key: did you mean watchdog?\n",
         "-> sudo nano /etc/pinion/second.toml, then sudo systemctl restart pinion-mcu@second\n",
-        "  error    Pinion does not run, though its service is enabled (pinion-mcu@second)\n",
+        "  error    Pinion does not run, although its service is enabled (pinion-mcu@second)\n",
     ] {
         assert!(text.contains(line), "{line}\n{text}");
     }
@@ -266,7 +266,7 @@ fn false_processes_of_another_user_change_no_advice() {
         tree.process_in(pids.next().unwrap(), group, MALLORY, "", command);
     }
     let after = tree.doctor();
-    let ignored = "other users have processes with the names of a Pinion or a klippy, which do not count here: 100, 101, 102, 103, 104 and 15 more\n";
+    let ignored = "processes of other users are called like a Pinion or a klippy, and do not count here: 100, 101, 102, 103, 104 and 15 more\n";
     let remedy = "           -> if one of them is yours, have a service start it\n";
     assert!(after.contains(ignored), "{after}");
     assert_eq!(after.replace(&format!("  ok       {ignored}{remedy}"), ""), before);
@@ -281,7 +281,7 @@ fn a_false_pinion_of_the_host_changes_no_advice() {
     tree.put("home/pi/pins.toml", "watchdog = true\n");
     tree.process(5, "klipper", 54321, "", &["pinion", "run", "--config", "/home/pi/pins.toml"]);
     let after = tree.doctor();
-    let ignored = "other users have processes with the names of a Pinion or a klippy, which do not count here: 5\n";
+    let ignored = "processes of other users are called like a Pinion or a klippy, and do not count here: 5\n";
     let remedy = "           -> if one of them is yours, have a service start it\n";
     assert_eq!(after.replace(&format!("  ok       {ignored}{remedy}"), ""), before);
     assert!(after.contains(ignored) && !after.contains("usermod"), "{after}");
@@ -407,7 +407,7 @@ fn only_the_callers_own_processes_count_beside_those_of_services_and_root() {
         let falses = ["pinion", "/tmp/klippy.py", "klipper_mcu"].map(|name| called(name, MALLORY));
         let [pinion, klippy, _] = &falses;
         let mut after = doctor(0, None);
-        let strangers = format!("which do not count here: {}, {}", pinion.0.id(), klippy.0.id());
+        let strangers = format!("and do not count here: {}, {}", pinion.0.id(), klippy.0.id());
         assert!(is_told(&after, &strangers), "{after:#?}");
         after.retain(|finding| finding["check"] != "strangers");
         assert_eq!(after, before);

@@ -219,7 +219,7 @@ fn a_command_that_is_printed_is_whole() {
     );
     end(&address, server);
     let log = card.refused(&["light", "--pin", "GPIO24"]);
-    assert!(log.contains("call it with --yes"), "{log}");
+    assert!(log.contains("use --yes"), "{log}");
 }
 
 #[test]
@@ -364,7 +364,7 @@ fn a_device_that_is_there_under_another_name_is_not_added_again() {
         [("lis2dw", "lis2dw bed", "dtparam=spi=on"), ("bme280", "temperature_sensor room", "dtparam=i2c_arm=on")]
     {
         let told = card.added(&[device, "--yes"]);
-        assert!(told.contains(&format!("[{section}] is in printer.cfg already")), "{told}");
+        assert!(told.contains(&format!("[{section}] is already in printer.cfg")), "{told}");
         assert!(card.read("boot/firmware/config.txt").contains(&format!("\n{line}\n")));
         assert!(!card.path(&card.beside(&format!("pinion/{device}.cfg"))).exists());
     }
@@ -378,7 +378,7 @@ fn a_device_that_is_there_under_another_name_is_not_added_again() {
 fn a_second_device_has_a_name() {
     let card = Card::pi().with_printer("[mcu EBB]\nserial: /dev/serial/by-id/ebb\n[adxl345]\ncs_pin: EBB:PB12\n[resonance_tester]\naccel_chip: adxl345\n");
     let log = card.refused(&["adxl345", "--yes"]);
-    assert!(log.contains("is on the MCU EBB: give this one another name: pinion add adxl345 --name NAME"), "{log}");
+    assert!(log.contains("is on the MCU EBB: give this device another name: pinion add adxl345 --name NAME"), "{log}");
     assert!(!card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on"));
     let told = card.added(&["adxl345", "--name", "bed", "--yes"]);
     assert!(told.contains("+ [adxl345 bed]\n") && told.contains("\n  ACCELEROMETER_QUERY CHIP=bed\n"), "{told}");
@@ -404,14 +404,15 @@ fn a_repeated_call_draws_what_was_written() {
     let told = card.added(&["relay", "--yes"]);
     assert!(told.contains("pin 16  GPIO23") && told.contains("Nothing is left to change."), "{told}");
     assert!(
-        card.refused(&["relay", "--pin", "18", "--yes"]).contains("relay is on GPIO23 (pin 16) already: take it back")
+        card.refused(&["relay", "--pin", "18", "--yes"])
+            .contains("relay is already on GPIO23 (pin 16): take that back")
     );
     card.added(&["lis2dw", "--bus", "i2c", "--yes"]);
     let told = card.added(&["lis2dw", "--yes"]);
     assert!(told.contains("by I2C\n") && told.contains("Nothing is left to change."), "{told}");
-    assert!(card.refused(&["lis2dw", "--bus", "spi", "--yes"]).contains("lis2dw is connected by I2C already"));
+    assert!(card.refused(&["lis2dw", "--bus", "spi", "--yes"]).contains("lis2dw is already connected by I2C"));
     assert!(!card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on"));
-    assert!(card.refused(&["adxl345", "--pin", "11"]).contains("--pin: adxl345 has no line of its own"));
+    assert!(card.refused(&["adxl345", "--pin", "11"]).contains("--pin: adxl345 needs no line here"));
 }
 
 /// The user has changed lines and files since.
@@ -434,10 +435,10 @@ fn an_undo_leaves_what_was_changed_and_says_so() {
             || told.contains("keeps its include"),
         "{told}"
     );
-    assert!(told.contains("config.txt keeps lines below \"# pinion add adxl345\": they were changed since"), "{told}");
+    assert!(told.contains("config.txt keeps lines below \"# pinion add adxl345\": they were changed later"), "{told}");
     assert_eq!(card.read("boot/firmware/config.txt"), config);
     assert_eq!(card.read(PRINTER), text);
-    assert!(told.contains("adxl345.cfg was changed since"), "{told}");
+    assert!(told.contains("adxl345.cfg was changed later"), "{told}");
     assert!(card.read(&format!("{own}.removed")).contains("axes_map: x,z,y"));
     // The copies of before are still there.
     assert_eq!(card.read(&format!("{PRINTER}.before-pinion")), PRINTER_CFG);
@@ -472,7 +473,7 @@ fn a_picture_replaces_no_other_file() {
     let card = Card::pi();
     card.put("mine.cfg", "precious");
     let path = card.path("mine.cfg").display().to_string();
-    assert!(card.refused(&["adxl345", "--dry-run", "--picture", &path]).contains("exists, and is not a picture"));
+    assert!(card.refused(&["adxl345", "--dry-run", "--picture", &path]).contains("exists but is not a picture"));
     assert_eq!(card.read("mine.cfg"), "precious");
     let svg = card.path("users.svg").display().to_string();
     card.added(&["relay", "--yes"]);
@@ -545,7 +546,7 @@ fn two_calls_at_once_lose_nothing() {
         });
         for (device, done) in ["adxl345", "bme280"].iter().zip(&done) {
             let log = String::from_utf8_lossy(&done.stderr);
-            assert!(done.status.success() || log.contains("call this again"), "{log}");
+            assert!(done.status.success() || log.contains("run this command again"), "{log}");
             card.added(&[device, "--yes"]);
         }
         let config = card.read("boot/firmware/config.txt");
@@ -564,7 +565,7 @@ fn an_undo_for_one_printer_leaves_the_other_one_s_bus() {
     card.added(&["adxl345", "--yes", "--config", &config]);
     assert!(card.refused(&["adxl345", "--yes", "--undo"]).contains("there are several hosts"));
     let told = card.added(&["adxl345", "--yes", "--undo", "--config", &config]);
-    assert!(told.contains(&format!("keeps \"dtparam=spi=on\": [lis2dw] (/{second}) needs it")), "{told}");
+    assert!(told.contains(&format!("keeps \"dtparam=spi=on\": [lis2dw] (/{second}) still needs it")), "{told}");
     assert!(card.read("boot/firmware/config.txt").contains("\ndtparam=spi=on\n"));
 }
 

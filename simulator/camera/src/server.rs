@@ -175,7 +175,7 @@ struct Request {
 /// Why a request is refused: the status, and a line for a person.
 struct Refusal(&'static str, &'static str);
 
-const BAD_REQUEST: Refusal = Refusal("400 Bad Request", "This is no HTTP request.");
+const BAD_REQUEST: Refusal = Refusal("400 Bad Request", "This is not an HTTP request.");
 const FORBIDDEN: Refusal = Refusal(
     "403 Forbidden",
     "The camera is not served under this name. Use localhost or an IP address in the URL. For other names start it with an address of your network: --camera ADDR:PORT.",

@@ -19,7 +19,7 @@
 //! 4. Nothing here calls a function that this library replaces, except through `real`. The lock of `threads` and the
 //!    waits for the token use the futex call of the kernel directly.
 //!
-//! A child that klippy starts is no participant: it runs in real time (`children`).
+//! A child that klippy starts is no participant: it runs in real time (`children`, `fork`).
 //!
 //! On a computer of 32 bits nothing is here: programs with times of 64 bits call other functions there.
 
@@ -33,6 +33,8 @@ mod children;
 mod clocks;
 #[cfg(target_pointer_width = "64")]
 mod descriptors;
+#[cfg(target_pointer_width = "64")]
+mod fork;
 #[cfg(target_pointer_width = "64")]
 mod locks;
 #[cfg(target_pointer_width = "64")]

@@ -397,7 +397,7 @@ impl Board for SimBoard {
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let wired = self.pin(pin, reason::ADC_OPEN)?;
         if !matches!(wired.wire.kind(), Kind::Analog | Kind::Free) {
-            return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
+            return Err(wired.is_not("an ADC channel", reason::ADC_OPEN));
         }
         let noise = Noise::of(&wired.name, self.seed);
         let adc = SimAdc { wire: wired.wire.clone(), clock: self.clock.clone(), noise };

@@ -161,7 +161,7 @@ impl SimConfig {
     fn validate_part(&self, part: &dyn Part, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
         let whose = &format!("part `{}`", part.name());
         if self.parts.iter().filter(|other| other.part().name() == part.name()).count() > 1 {
-            return Err(Trouble::new("there are two of it")
+            return Err(Trouble::new("there are two with this name")
                 .remedy("remove one, or give them different names")
                 .of(whose));
         }
@@ -189,7 +189,7 @@ impl SimConfig {
             Some(Socket::I2c { bus, address }) => {
                 printer.check_i2c_bus(whose, bus)?;
                 if !(0x08..0x78).contains(&address) {
-                    return wrong(whose, "address", &format!("{address} is no 7 bit address"), "give 8 to 119");
+                    return wrong(whose, "address", &format!("{address} is not a 7-bit address"), "give 8 to 119");
                 }
                 if neighbours.any(|other| Some(other) == socket) {
                     return wrong(whose, "address", &format!("{address} is taken on this bus"), "give another");

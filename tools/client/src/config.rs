@@ -81,7 +81,7 @@ impl Config {
         if !status.is_config || status.crc != self.crc() {
             return Err(Error::Plan {
                 subject: "configuration".to_owned(),
-                why: "the MCU did not take it over: stop any other host on its tty".to_owned(),
+                why: "the MCU did not accept it: stop any other host on its tty".to_owned(),
             });
         }
         Ok(status)
@@ -116,10 +116,7 @@ impl Client {
     pub fn reset(&mut self) -> Result<(), Error> {
         let command =
             ["config_reset", "reset"].into_iter().find(|name| self.messages().has_command(name)).ok_or_else(|| {
-                Error::Plan {
-                    subject: "reset".to_owned(),
-                    why: "the MCU has no reset command: start it anew".to_owned(),
-                }
+                Error::Plan { subject: "reset".to_owned(), why: "the MCU has no reset command: restart it".to_owned() }
             })?;
         let until = Instant::now() + RESET_TIMEOUT;
         self.emergency_stop()?;

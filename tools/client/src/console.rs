@@ -19,9 +19,9 @@ const NAMES_SHOWN: usize = 40;
 
 /// The console's own commands, with their help texts.
 const OWN: &[(&str, &str)] = &[
-    ("help", "help [COMMAND]: what there is, or the parameters of a command"),
+    ("help", "help [COMMAND]: list the commands, or the parameters of a command"),
     ("delay", "delay SECONDS: wait, and print what comes meanwhile"),
-    ("reset", "reset: drop the configuration and start anew, as FIRMWARE_RESTART does"),
+    ("reset", "reset: drop the configuration and start again, as FIRMWARE_RESTART does"),
     ("stats", "stats: turn the MCU's statistics on or off"),
     ("quit", "quit: end (also Ctrl-D)"),
 ];
@@ -110,7 +110,7 @@ impl Console {
                 let seconds = seconds.strip_suffix('s').unwrap_or(seconds).parse().ok();
                 let seconds: f64 = seconds
                     .filter(|seconds| (0.0..=DELAY_MAX_S).contains(seconds))
-                    .ok_or("delay: seconds are wanted, such as 0.5")?;
+                    .ok_or("delay: give seconds, such as 0.5")?;
                 self.listen(Duration::from_secs_f64(seconds), print)?;
             }
             ("reset", []) => {

@@ -95,7 +95,7 @@ impl fmt::Display for Error {
                 write!(f, "cannot {doing} {port}: {source}: check that the MCU program runs and that you may open it")
             }
             Error::NoTerminal { port } => {
-                write!(f, "{port} is no terminal: name the link of a Pinion that runs, such as /tmp/klipper_host_mcu")
+                write!(f, "{port} is not a terminal: name the link of a running Pinion, such as /tmp/klipper_host_mcu")
             }
             Error::Closed { port } => {
                 write!(f, "{port} was closed by the other end: look at its log")

@@ -43,7 +43,7 @@ impl Files for Disk {
             let cause = format!("it is longer than {} MiB", FILE_MAX >> 20);
             return Err(io::Error::new(io::ErrorKind::FileTooLarge, cause));
         }
-        String::from_utf8(bytes).map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is no UTF-8 text"))
+        String::from_utf8(bytes).map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8 text"))
     }
 
     fn names(&self, folder: &Path, most: usize) -> Vec<String> {

@@ -187,7 +187,7 @@ fn hostile_configurations_end_at_once_with_a_line() {
     fs::File::create(&path).unwrap().set_len(1 << 30).unwrap();
     assert!(read().contains("it is longer than 4 MiB"), "{}", read());
     fs::write(&path, [0xff, 0xfe]).unwrap();
-    assert!(read().contains("it is no UTF-8 text"), "{}", read());
+    assert!(read().contains("it is not UTF-8 text"), "{}", read());
     assert!(Disk.text(Path::new("/dev/zero")).is_err());
 }
 

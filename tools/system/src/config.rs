@@ -162,13 +162,13 @@ pub fn read(bytes: &[u8], file: &dyn fmt::Display) -> Result<Given, Trouble> {
     match std::str::from_utf8(bytes) {
         Ok(text) if text.contains('\0') => {
             let trouble =
-                Trouble::new("there are zero bytes, as a power cut leaves them").remedy("write the file anew");
+                Trouble::new("there are zero bytes, as a power cut leaves them").remedy("write the file again");
             Err(trouble.at(file, text, text.find('\0').unwrap_or(0)))
         }
         Ok(text) => parse(text, file),
         Err(error) => {
             let good = String::from_utf8_lossy(&bytes[..error.valid_up_to()]);
-            Err(Trouble::new("this is no UTF-8 text").remedy("write it anew").at(file, &good, good.len()))
+            Err(Trouble::new("this is not UTF-8 text").remedy("write the file again").at(file, &good, good.len()))
         }
     }
 }
@@ -284,7 +284,7 @@ mod tests {
         );
         assert_eq!(
             error("mode = \"0999\""),
-            "f.toml:1:8: mode: an octal number up to 0777 is wanted, such as 0660: write it such as mode = \"0660\""
+            "f.toml:1:8: mode: an octal number up to 0777 is needed, such as 0660: write it such as mode = \"0660\""
         );
         assert!(error("board = \"toaster\"").contains("f.toml:1:9: board: there are the boards linux, sim"));
         assert!(error("dialect = \"v0.10\"").contains("f.toml:1:11: dialect: there are the dialects "));
@@ -320,7 +320,7 @@ mod tests {
         assert!(error.starts_with("/nonexistent.toml: No such file"), "{error}");
         let file = tempfile::NamedTempFile::new().unwrap();
         fs::write(file.path(), b"cpu = 3\n#\xff").unwrap();
-        assert!(load(file.path()).unwrap_err().to_string().contains(":2:2: this is no UTF-8"));
+        assert!(load(file.path()).unwrap_err().to_string().contains(":2:2: this is not UTF-8"));
     }
 
     proptest! {

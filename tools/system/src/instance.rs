@@ -84,7 +84,7 @@ impl Instance {
     pub fn restart(&self) -> String {
         match &self.unit {
             Some(unit) => format!("sudo systemctl restart {}", word(unit)),
-            None => "start it anew".to_owned(),
+            None => "restart Pinion".to_owned(),
         }
     }
 

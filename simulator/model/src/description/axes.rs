@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::pin::PinName;
+use super::whole;
 
 /// The end of an axis with its endstop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -35,7 +36,7 @@ pub struct AxisConfig {
     /// Steps per millimeter.
     pub steps_per_mm: f64,
     /// Microsteps per full step, for printer.cfg. The motor has 200 full steps per turn.
-    #[serde(default = "default_microsteps")]
+    #[serde(default = "whole::<16, _>")]
     pub microsteps: u32,
     /// The lowest place of the axis.
     #[serde(default)]
@@ -43,7 +44,7 @@ pub struct AxisConfig {
     /// The axis moves from `min_mm` to this position. Without this key it has no end.
     pub travel_mm: Option<f64>,
     /// How far beyond either end of its travel the axis moves before it hits something and loses steps.
-    #[serde(default = "default_overtravel_mm")]
+    #[serde(default = "whole::<2, _>")]
     pub overtravel_mm: f64,
     /// The initial position of the axis.
     #[serde(default)]
@@ -56,7 +57,7 @@ pub struct AxisConfig {
     /// Where the endstop closes. Without this key it closes at that end.
     pub endstop_mm: Option<f64>,
     /// Speed of homing, for printer.cfg.
-    #[serde(default = "default_homing_mm_per_s")]
+    #[serde(default = "whole::<5, _>")]
     pub homing_mm_per_s: f64,
     /// The place on the bed where a motor of the z axis holds the gantry, or the bed: x and y.
     pub at_mm: Option<[f64; 2]>,
@@ -78,7 +79,7 @@ pub struct CarriageConfig {
     /// The highest place.
     pub travel_mm: f64,
     /// How far beyond either end of its travel it moves before it hits something.
-    #[serde(default = "default_overtravel_mm")]
+    #[serde(default = "whole::<2, _>")]
     pub overtravel_mm: f64,
     /// The initial place.
     #[serde(default)]
@@ -92,20 +93,8 @@ pub struct CarriageConfig {
     pub endstop_mm: Option<f64>,
 }
 
-fn default_microsteps() -> u32 {
-    16
-}
-
-fn default_overtravel_mm() -> f64 {
-    2.0
-}
-
 fn default_end() -> End {
     End::Min
-}
-
-fn default_homing_mm_per_s() -> f64 {
-    5.0
 }
 
 /// A delta printer: three towers around the bed. Their carriages hold the nozzle by arms. The carriages are the axes

@@ -125,7 +125,7 @@ impl<'a> UsedPins<'a> {
         };
         let before = self.used.insert((board, on_board(&pin.name).1.to_owned()), sharers);
         if before.is_some_and(|others| others.is_none() || others != sharers) {
-            return wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name");
+            return wrong(whose, key, &format!("pin `{}` already has a use", pin.name), "give every pin its own name");
         }
         Ok(())
     }

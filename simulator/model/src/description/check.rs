@@ -21,7 +21,7 @@ pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>
         if !is_word(name) {
             no_name(kind, name)
         } else if !seen.insert(name) {
-            wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
+            wrong(kind, "name", &format!("two have the name `{name}`"), "rename one")
         } else {
             Ok(())
         }
@@ -30,7 +30,7 @@ pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>
 
 /// The error for a name that klippy would not accept.
 pub(crate) fn no_name(whose: &str, name: &str) -> Result<(), Trouble> {
-    wrong(whose, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
+    wrong(whose, "name", &format!("`{name}` is not a name"), "use letters, digits, `_`, `-`, `.` and `/`")
 }
 
 /// Checks that the description has an entry with this name; `kind` is its table.

@@ -7,6 +7,7 @@ use super::check::{Bound, Trouble, check, fault};
 use super::pin::PinName;
 use super::sensor::Sensor;
 use super::thermistor::{NoThermistor, Thermistor};
+use super::whole;
 
 /// A heater, the mass that it heats, and the thermistor in it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,7 +29,7 @@ pub struct HeaterConfig {
     #[serde(default)]
     pub sensor_lag_s: f64,
     /// Temperature of the surroundings.
-    #[serde(default = "default_ambient_celsius")]
+    #[serde(default = "whole::<25, _>")]
     pub ambient_celsius: f64,
     /// Initial temperature. Without this key it is the temperature of the surroundings.
     pub start_celsius: Option<f64>,
@@ -41,7 +42,7 @@ pub struct HeaterConfig {
     #[serde(default)]
     pub noise_counts: f64,
     /// The pull-up resistor from the ADC's input to its reference.
-    #[serde(default = "default_pullup_ohm")]
+    #[serde(default = "whole::<4700, _>")]
     pub pullup_ohm: f64,
     /// The thermistor's resistance at one temperature (with `beta_k`) or at three.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -52,14 +53,6 @@ pub struct HeaterConfig {
     pub points_celsius_fraction: Vec<(f64, f64)>,
     /// The thermistor's beta.
     pub beta_k: Option<f64>,
-}
-
-fn default_ambient_celsius() -> f64 {
-    25.0
-}
-
-fn default_pullup_ohm() -> f64 {
-    4700.0
 }
 
 /// A fan that needs time to spin up and down.
@@ -75,7 +68,7 @@ pub struct FanConfig {
     /// An input that is high for the first half of each pulse of the tachometer.
     pub tachometer_pin: Option<PinName>,
     /// Pulses of the tachometer per revolution.
-    #[serde(default = "default_pulses_per_revolution")]
+    #[serde(default = "whole::<2, _>")]
     pub pulses_per_revolution: u32,
     /// Speed at full power.
     pub max_rpm: f64,
@@ -87,10 +80,6 @@ pub struct FanConfig {
     /// Additional heat loss of that heater while the fan has power, for each kelvin above the surroundings.
     #[serde(default)]
     pub cooling_w_per_k: f64,
-}
-
-fn default_pulses_per_revolution() -> u32 {
-    2
 }
 
 fn default_spin_up_s() -> f64 {
@@ -118,7 +107,7 @@ impl HeaterConfig {
             return self.thermistor().map(|thermistor| Some(Sensor::Thermistor(thermistor)));
         }
         if !self.points_celsius_ohm.is_empty() {
-            return Err(fault(whose, POINTS, "it has points_celsius_ohm, too", "remove one of them"));
+            return Err(fault(whose, POINTS, "it also has points_celsius_ohm", "remove one of them"));
         }
         for (celsius, fraction) in &self.points_celsius_fraction {
             check(whose, POINTS, *celsius, Bound::Any)?;

@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::axes::DeltaConfig;
+use super::whole;
 
 /// How the motors move the head.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -86,12 +87,8 @@ pub struct WinchConfig {
     /// The places where the cables begin. The first three determine the head's place.
     pub anchors_mm: Vec<[f64; 3]>,
     /// From the middle of the bed to its edge.
-    #[serde(default = "default_winch_bed_mm")]
+    #[serde(default = "whole::<200, _>")]
     pub bed_radius_mm: f64,
-}
-
-fn default_winch_bed_mm() -> f64 {
-    200.0
 }
 
 impl WinchConfig {

@@ -16,3 +16,8 @@ pub(crate) mod rails;
 pub(crate) mod sensor;
 pub(crate) mod thermistor;
 mod validate;
+
+/// The default of a key that is a whole number, for `serde`.
+pub(crate) fn whole<const N: u16, T: From<u16>>() -> T {
+    T::from(N)
+}

@@ -27,7 +27,7 @@ impl TryFrom<String> for PinName {
             Ok(PinName { name: name.to_owned(), inverted })
         } else {
             Err(format!(
-                "`{text}` is no pin name: use letters, digits, `_`, `-`, `.` and `/`, with `!` \
+                "`{text}` is not a pin name: use letters, digits, `_`, `-`, `.` and `/`, with `!` \
                  in front to invert, and `BOARD:` for a pin of another board"
             ))
         }

@@ -43,7 +43,7 @@ impl Printer<'_> {
         }
         match (self.chosen, self.kinematics()) {
             (Some(_), _) if self.delta.is_some() || self.corexy => {
-                let trouble = Trouble::new("there is another kinematics").remedy("remove `corexy` and `[delta]`");
+                let trouble = Trouble::new("it also has another kinematics").remedy("remove `corexy` and `[delta]`");
                 return Err(trouble.of("[kinematics]"));
             }
             (_, Kinematics::Delta(delta)) => delta.validate(self)?,
@@ -259,7 +259,7 @@ fn unique_on_boards<'a>(kind: &str, names: impl Iterator<Item = &'a String>) -> 
             return no_name(kind, name);
         }
         if !seen.insert(name) {
-            return wrong(kind, "name", &format!("two are called `{name}`"), "rename one");
+            return wrong(kind, "name", &format!("two have the name `{name}`"), "rename one");
         }
     }
     Ok(())
@@ -343,7 +343,7 @@ impl SpiBusConfig {
         check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
         let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|pin| pin.name == **name));
         unknown.map_or(Ok(()), |name| {
-            let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
+            let cause = format!("`{name}` is not a pin of an [[output]] or [[led]]");
             wrong(whose, "trace_pins", &cause, "name such a pin, without `!`")
         })
     }

@@ -3,6 +3,7 @@
 
 pub(crate) mod assemble;
 pub(crate) mod bed;
+pub(crate) mod crc;
 pub(crate) mod dock;
 pub(crate) mod follower;
 pub(crate) mod i2c;
@@ -14,6 +15,7 @@ pub(crate) mod noise;
 pub(crate) mod pace;
 pub(crate) mod physics;
 pub(crate) mod recorder;
+pub(crate) mod register_map;
 pub(crate) mod ring;
 pub(crate) mod seqlock;
 pub(crate) mod serial;

@@ -70,17 +70,35 @@ impl Socket {
     }
 }
 
-/// A chip of a chain without a description: its shift register of 40 bits.
-struct Shift([u8; 5]);
+/// The shift register of a chip: the answer leaves it while a message comes in.
+pub(crate) struct ShiftRegister<const BYTES: usize> {
+    bytes: [u8; BYTES],
+    /// Number of bytes since the chip was selected.
+    pub(crate) count: usize,
+}
 
-impl SpiChip for Shift {
+impl<const BYTES: usize> ShiftRegister<BYTES> {
+    /// A message begins, and this is the answer.
+    pub(crate) fn load(answer: [u8; BYTES]) -> ShiftRegister<BYTES> {
+        ShiftRegister { bytes: answer, count: 0 }
+    }
+
+    /// The message: the last bytes of a longer one. `None` if it is shorter.
+    pub(crate) fn message(&self) -> Option<[u8; BYTES]> {
+        (self.count >= BYTES).then_some(self.bytes)
+    }
+}
+
+/// A chip of a chain without a description has only this.
+impl<const BYTES: usize> SpiChip for ShiftRegister<BYTES> {
     fn knows_mode(&self, _mode: u8) -> bool {
         true
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
-        self.0.rotate_left(1);
-        std::mem::replace(&mut self.0[4], byte)
+        self.count += 1;
+        self.bytes.rotate_left(1);
+        std::mem::replace(&mut self.bytes[BYTES - 1], byte)
     }
 }
 
@@ -169,7 +187,7 @@ impl SpiBus {
         }
         let chips = &mut wires.sockets[at].chips;
         while chips.len() < length {
-            chips.push(Box::new(Shift([0; 5])));
+            chips.push(Box::new(ShiftRegister::load([0; 5])));
         }
         chips[place] = chip;
         new

@@ -127,7 +127,7 @@ impl WiredPin {
     }
 
     /// The error for a pin that is not of the `wanted` kind.
-    pub(crate) fn is_no(&self, wanted: &str, reason: ShutdownReason) -> Shutdown {
+    pub(crate) fn is_not(&self, wanted: &str, reason: ShutdownReason) -> Shutdown {
         let is = match self.wire.kind() {
             Kind::Output => "an output",
             Kind::Input => "an input",
@@ -140,7 +140,7 @@ impl WiredPin {
             Kind::Free => "free",
         };
         let (name, wire) = (&self.name, self.wire.describe());
-        Shutdown::because(reason, format!("pin {name} of the simulated printer is {is} ({wire}), no {wanted}"))
+        Shutdown::because(reason, format!("pin {name} of the simulated printer is {is} ({wire}), not {wanted}"))
             .remedy("choose another pin")
     }
 }
@@ -190,11 +190,11 @@ impl Line for SimLine {
             // Only the resistor decides the level of a free pin.
             Direction::Input(bias) if kind == Kind::Free => self.begin(bias == Bias::PullUp),
             Direction::Output { .. } | Direction::OpenDrain => {
-                return Err(self.pin.is_no("output", reason::NOT_OUTPUT));
+                return Err(self.pin.is_not("an output", reason::NOT_OUTPUT));
             }
             Direction::Input(_) if kind == Kind::Shared => self.pin.wire.release(self.time.of_the_caller()),
             Direction::Input(_) if kind == Kind::Input => {}
-            Direction::Input(_) => return Err(self.pin.is_no("input", reason::NOT_INPUT)),
+            Direction::Input(_) => return Err(self.pin.is_not("an input", reason::NOT_INPUT)),
         }
         Ok(())
     }
@@ -222,7 +222,7 @@ pub(crate) struct SimPwm {
 impl Pwm for SimPwm {
     fn set(&mut self, value: u16) -> Result<(), Shutdown> {
         let share = (f64::from(value) / f64::from(PWM_MAX)).min(1.0);
-        self.pin.pwm(share, self.clock.now()).ok_or_else(|| self.pin.is_no("hardware PWM channel", reason::PWM_CONFIG))
+        self.pin.pwm(share, self.clock.now()).ok_or_else(|| self.pin.is_not("a PWM channel", reason::PWM_CONFIG))
     }
 
     fn set_cycle(&mut self, _cycle: Ticks, value: u16) -> Result<(), Shutdown> {

@@ -31,6 +31,7 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::engine::register_map::OnBus;
 use crate::klippy::layout::{FULL_STEPS, Layout};
 use crate::klippy::sections::Sections;
 
@@ -111,7 +112,7 @@ impl Part for AngleConfig {
             AngleChip::A1333 => workshop.solder_spi(self, A1333::new(shaft)),
             AngleChip::As5047d => workshop.solder_spi(self, As5047d::new(shaft)),
             AngleChip::Tle5012b => workshop.solder_spi(self, Tle5012b::new(shaft, clock)),
-            AngleChip::Mt6816 => workshop.solder_spi(self, Mt6816::new(shaft)),
+            AngleChip::Mt6816 => workshop.solder_spi(self, OnBus::new(Mt6816 { shaft, latched: 0 })),
             AngleChip::Mt6826s => workshop.solder_spi(self, Mt6826s::new(shaft)),
         }
         Ok(())
@@ -128,9 +129,10 @@ impl Part for AngleConfig {
 
 #[cfg(test)]
 mod tests {
-    use super::shaft::{crc8, even_parity};
+    use super::shaft::even_parity;
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::crc::crc8;
     use crate::engine::motion::Axis;
     use crate::engine::spi::SpiChip;
     use pinion_firmware::time::{Clock, Ticks, VirtualClock};
@@ -233,7 +235,7 @@ mod tests {
 
     #[test]
     fn an_mt6816_and_an_mt6826s_go_on_from_the_register_that_was_named() {
-        let mut chip = Mt6816::new(shaft(2));
+        let mut chip = OnBus::new(Mt6816 { shaft: shaft(2), latched: 0 });
         let angle = 0x200au16 << 2;
         assert_eq!(transfer(&mut chip, &[0x83, 0, 0])[1..], (angle | even_parity(angle)).to_be_bytes());
         assert_eq!(transfer(&mut chip, &[0x84, 0])[1..], [(angle | even_parity(angle)) as u8]);
@@ -241,7 +243,7 @@ mod tests {
         let mut chip = Mt6826s::new(shaft(1));
         let answer = transfer(&mut chip, &[0x30, 0x03, 0, 0, 0, 0]);
         assert_eq!(answer[2..5], [0x80, 0x14, 0]);
-        assert_eq!(answer[5], crc8(0x07, 0, &[0x80, 0x14, 0]));
+        assert_eq!(answer[5], crc8(0x07, 0, [0x80, 0x14, 0]));
         transfer(&mut chip, &[0x60, 0x0d, 0x05]);
         assert_eq!(transfer(&mut chip, &[0x30, 0x0d, 0])[2], 5);
         assert_eq!(transfer(&mut chip, &[0x30, 0x0e, 0])[2], 0x50);

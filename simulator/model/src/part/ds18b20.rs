@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::printer::Printer;
+use crate::description::whole;
 use crate::engine::physics::Heater;
 use crate::engine::time::pass;
 use crate::klippy::layout::Layout;
@@ -28,12 +29,8 @@ pub struct Ds18b20Config {
     /// The heater that it measures.
     pub heater: String,
     /// How long a reading takes.
-    #[serde(default = "default_conversion_ms")]
+    #[serde(default = "whole::<750, _>")]
     pub conversion_ms: u64,
-}
-
-fn default_conversion_ms() -> u64 {
-    750
 }
 
 impl Part for Ds18b20Config {
@@ -43,7 +40,7 @@ impl Part for Ds18b20Config {
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.serial.is_empty() || !self.serial.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)) {
-            let cause = format!("`{}` is no name of a device", self.serial);
+            let cause = format!("`{}` is not the name of a device", self.serial);
             return wrong(whose, "serial", &cause, "give `28-` and twelve hexadecimal digits");
         }
         check(whose, "conversion_ms", self.conversion_ms as f64, Bound::NotNegative)?;

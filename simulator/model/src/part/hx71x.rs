@@ -110,7 +110,7 @@ impl Part for Hx71xConfig {
         for (key, pin) in self.pins() {
             match (pin, &self.bus) {
                 (None, None) => return wrong(whose, key, "it has none", "add it, or `bus`"),
-                (Some(_), Some(_)) => return wrong(whose, key, "it has a bus, too", "remove one of them"),
+                (Some(_), Some(_)) => return wrong(whose, key, "it also has a bus", "remove one of them"),
                 _ => {}
             }
         }

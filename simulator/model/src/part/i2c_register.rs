@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::Trouble;
-use crate::engine::i2c::I2cChip;
+use crate::engine::register_map::{OnBus, RegisterChip, RegisterMap};
 
 /// A chip.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,69 +50,59 @@ impl Part for I2cRegisterConfig {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
-        workshop.solder_i2c(self, Chip::new(self.chip));
+        workshop.solder_i2c(self, Chip::on_bus(self.chip));
         Ok(())
     }
 }
 
 struct Chip {
     chip: I2cRegisterChip,
-    registers: [u8; 256],
-    /// The register of the next byte; `None` before the first byte of a message.
-    next: Option<u8>,
+    registers: RegisterMap<u8>,
 }
 
 impl Chip {
-    fn new(chip: I2cRegisterChip) -> Chip {
-        Chip { chip, registers: [0; 256], next: None }
-    }
-
-    /// The register that a message's first byte names.
-    fn register(&self, byte: u8) -> u8 {
-        match self.chip {
-            // MCP4451: the address in the upper half; the lower half has the command and the ninth bit.
-            I2cRegisterChip::Mcp4451 => byte >> 4,
-            // The upper bits say whether the register counts up.
-            I2cRegisterChip::Pca9533 | I2cRegisterChip::Pca9632 => byte & 0x0f,
-            I2cRegisterChip::Mcp4018 | I2cRegisterChip::Mcp4728 | I2cRegisterChip::Sx1509 => byte,
-        }
+    fn on_bus(chip: I2cRegisterChip) -> OnBus<Chip> {
+        OnBus::new(Chip { chip, registers: RegisterMap::holding(256, &[]) })
     }
 }
 
-impl I2cChip for Chip {
-    fn start(&mut self, read: bool) -> bool {
-        if !read {
-            self.next = None;
-        }
-        true
-    }
-
-    fn write(&mut self, byte: u8) -> bool {
-        match self.next {
-            // It has one register.
-            None if self.chip == I2cRegisterChip::Mcp4018 => self.registers[0] = byte,
-            None => self.next = Some(self.register(byte)),
-            Some(register) => {
-                self.registers[usize::from(register)] = byte;
-                self.next = Some(register.wrapping_add(1));
+impl RegisterChip for Chip {
+    fn register(&mut self, first: u8, _is_spi: bool) -> (u8, bool) {
+        let register = match self.chip {
+            // It has one register, and a message has no address.
+            I2cRegisterChip::Mcp4018 => {
+                self.registers.write(0, first);
+                0
             }
-        }
-        true
+            // MCP4451: the address in the upper half; the lower half has the command and the ninth bit.
+            I2cRegisterChip::Mcp4451 => first >> 4,
+            // The upper bits say whether the register counts up.
+            I2cRegisterChip::Pca9533 | I2cRegisterChip::Pca9632 => first & 0x0f,
+            I2cRegisterChip::Mcp4728 | I2cRegisterChip::Sx1509 => first,
+        };
+        (register, true)
     }
 
-    fn read(&mut self) -> u8 {
-        let register = self.next.unwrap_or(0);
-        self.next = Some(register.wrapping_add(1));
-        self.registers[usize::from(register)]
+    fn read(&mut self, register: u8) -> u8 {
+        self.registers.read(register)
+    }
+
+    fn write(&mut self, register: u8, value: u8) {
+        self.registers.write(register, value);
+    }
+
+    fn next(&mut self, register: u8) -> u8 {
+        register.wrapping_add(1)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::i2c::I2cChip;
 
-    fn written(chip: I2cRegisterChip, message: &[u8]) -> Chip {
-        let mut chip = Chip::new(chip);
+    fn written(chip: I2cRegisterChip, message: &[u8]) -> OnBus<Chip> {
+        let mut chip = Chip::on_bus(chip);
         assert!(chip.start(false) && message.iter().all(|byte| chip.write(*byte)));
         chip.stop();
         chip
@@ -120,9 +110,9 @@ mod tests {
 
     #[test]
     fn each_chip_keeps_what_it_gets_in_the_register_that_it_names() {
-        assert_eq!(written(I2cRegisterChip::Mcp4018, &[0x55]).registers[0], 0x55);
-        assert_eq!(written(I2cRegisterChip::Mcp4451, &[0x60, 0x7f]).registers[6], 0x7f);
-        assert_eq!(written(I2cRegisterChip::Pca9533, &[0x15, 0xaa]).registers[5], 0xaa);
+        assert_eq!(written(I2cRegisterChip::Mcp4018, &[0x55]).chip.registers.get(0), 0x55);
+        assert_eq!(written(I2cRegisterChip::Mcp4451, &[0x60, 0x7f]).chip.registers.get(6), 0x7f);
+        assert_eq!(written(I2cRegisterChip::Pca9533, &[0x15, 0xaa]).chip.registers.get(5), 0xaa);
         let mut sx1509 = written(I2cRegisterChip::Sx1509, &[0x0e, 0x12, 0x34]);
         assert!(sx1509.start(false) && sx1509.write(0x0e) && sx1509.start(true));
         assert_eq!([sx1509.read(), sx1509.read()], [0x12, 0x34]);

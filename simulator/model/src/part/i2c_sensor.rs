@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::Trouble;
 use crate::description::printer::Printer;
+use crate::engine::crc;
 use crate::engine::i2c::I2cChip;
 use crate::engine::physics::Heater;
 use crate::klippy::layout::Layout;
@@ -231,11 +232,9 @@ fn checked((share, status): (f64, u16), start: u8) -> Vec<u8> {
     [bytes.as_slice(), &[crc8(&bytes, start)]].concat()
 }
 
-/// x^8 + x^5 + x^4 + 1, the highest bit first.
+/// x^8 + x^5 + x^4 + 1
 fn crc8(bytes: &[u8], start: u8) -> u8 {
-    bytes
-        .iter()
-        .fold(start, |crc, byte| (0..8).fold(crc ^ byte, |crc, _| crc << 1 ^ if crc & 0x80 == 0 { 0 } else { 0x31 }))
+    crc::crc8(0x31, start, bytes)
 }
 
 /// Calibration values of a BME280: dig_T1 to dig_T3, then those of the pressure, from Bosch's example.

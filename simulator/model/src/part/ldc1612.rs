@@ -23,8 +23,9 @@ use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
-use crate::engine::i2c::I2cChip;
 use crate::engine::noise::Noise;
+use crate::engine::register_map::Access::{Read, ReadWrite, Write};
+use crate::engine::register_map::{OnBus, Register, RegisterChip, RegisterMap};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
@@ -70,24 +71,25 @@ const WD_ERR2OUT: u16 = 1 << 13;
 const AH_ERR2OUT: u16 = 1 << 12;
 const AL_ERR2OUT: u16 = 1 << 11;
 
-/// The registers with their writable bits and their values at power-up.
-const REGISTERS: &[(u8, u16, u16)] = &[
-    (RCOUNT0, 0xffff, 0x0080),
-    (0x09, 0xffff, 0x0080), // RCOUNT1
-    (OFFSET0, 0xffff, 0),
-    (0x0d, 0xffff, 0), // OFFSET1
-    (SETTLECOUNT0, 0xffff, 0),
-    (0x11, 0xffff, 0), // SETTLECOUNT1
-    (CLOCK_DIVIDERS0, 0xffff, 0),
-    (0x15, 0xffff, 0), // CLOCK_DIVIDERS1
-    (ERROR_CONFIG, 0xffff, 0),
-    (CONFIG, 0xffff, 0x2801),
-    (MUX_CONFIG, 0xffff, 0x020f),
+/// The registers.
+const REGISTERS: &[Register<u16>] = &[
+    Register(RCOUNT0, ReadWrite, 0xffff, 0x0080),
+    Register(0x09, ReadWrite, 0xffff, 0x0080), // RCOUNT1
+    Register(OFFSET0, ReadWrite, 0xffff, 0),
+    Register(0x0d, ReadWrite, 0xffff, 0), // OFFSET1
+    Register(SETTLECOUNT0, ReadWrite, 0xffff, 0),
+    Register(0x11, ReadWrite, 0xffff, 0), // SETTLECOUNT1
+    Register(CLOCK_DIVIDERS0, ReadWrite, 0xffff, 0),
+    Register(0x15, ReadWrite, 0xffff, 0), // CLOCK_DIVIDERS1
+    Register(ERROR_CONFIG, ReadWrite, 0xffff, 0),
+    Register(CONFIG, ReadWrite, 0xffff, 0x2801),
+    Register(MUX_CONFIG, ReadWrite, 0xffff, 0x020f),
+    Register(RESET_DEV, Write, RESET_DEV_BIT, 0),
     // The chip itself writes INIT_IDRIVE.
-    (DRIVE_CURRENT0, 0xf800, 0),
-    (0x1f, 0xf800, 0), // DRIVE_CURRENT1
-    (MANUFACTURER_ID, 0, 0x5449),
-    (DEVICE_ID, 0, 0x3055),
+    Register(DRIVE_CURRENT0, ReadWrite, 0xf800, 0),
+    Register(0x1f, ReadWrite, 0xf800, 0), // DRIVE_CURRENT1
+    Register(MANUFACTURER_ID, Read, 0, 0x5449),
+    Register(DEVICE_ID, Read, 0, 0x3055),
 ];
 
 /// The chip's description.
@@ -161,11 +163,11 @@ impl Part for Ldc1612Config {
             check(whose, key, value, bound)?;
         }
         if self.drive_current > MAX_CURRENT {
-            let cause = format!("{} is no current of the chip", self.drive_current);
+            let cause = format!("{} is not a current of the chip", self.drive_current);
             return wrong(whose, "drive_current", &cause, &format!("give 0 to {MAX_CURRENT}"));
         }
         if self.yielding > 1.0 {
-            return wrong(whose, "yielding", "the bed gives way by more than all", "give a share of 1");
+            return wrong(whose, "yielding", "the bed cannot give way by more than all", "give a share of 1");
         }
         Ok(())
     }
@@ -174,7 +176,7 @@ impl Part for Ldc1612Config {
         let intb = ReadyLine::new("interrupt of ldc1612");
         workshop.wire(self.intb_pin.as_ref(), ready_pin(intb.clone()));
         let coil = Coil { config: self.clone(), bed: workshop.bed(), noise: workshop.noise(self) };
-        workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.clock.clone()));
+        workshop.solder_i2c(self, OnBus::new(Ldc1612::new(coil, intb, workshop.clock.clone())));
         Ok(())
     }
 
@@ -219,81 +221,58 @@ struct Ldc1612 {
     conversions: Conversions,
     /// Number of conversions that were read.
     read: u64,
-    /// By address.
-    registers: [u16; 128],
+    registers: RegisterMap<u16>,
     /// DATA0_LSB belongs to the last DATA0_MSB that was read.
     lsb: u16,
-    /// The addressed register.
-    pointer: u8,
-    /// The bytes written to it or to read from it; the next field counts the finished bytes.
+    /// The register of which a message has the first byte.
     word: u16,
-    bytes: usize,
 }
 
 impl Ldc1612 {
     fn new(coil: Coil, intb: Arc<ReadyLine>, clock: Arc<dyn TimeSource>) -> Ldc1612 {
-        let mut chip = Ldc1612 {
-            coil,
-            clock,
-            intb,
-            conversions: Conversions::NONE,
-            read: 0,
-            registers: [0; 128],
-            lsb: 0,
-            pointer: 0,
-            word: 0,
-            bytes: 0,
-        };
-        chip.reset();
+        let (conversions, registers) = (Conversions::NONE, RegisterMap::new(REGISTERS));
+        let mut chip = Ldc1612 { coil, clock, intb, conversions, read: 0, registers, lsb: 0, word: 0 };
+        chip.begin();
         chip
     }
 
-    fn reset(&mut self) {
-        self.registers = [0; 128];
-        for (address, _, value) in REGISTERS {
-            self.registers[usize::from(*address)] = *value;
-        }
-        self.begin();
-    }
-
-    fn get(&self, address: u8) -> u16 {
-        self.registers[usize::from(address & 0x7f)]
-    }
-
     fn reference_hz(&self) -> f64 {
-        let external = self.get(CONFIG) & REF_CLK_SRC != 0;
-        let divider = (self.get(CLOCK_DIVIDERS0) & 0x3ff).max(1);
+        let external = self.registers.get(CONFIG) & REF_CLK_SRC != 0;
+        let divider = (self.registers.get(CLOCK_DIVIDERS0) & 0x3ff).max(1);
         if external { EXTERNAL_CLOCK_HZ / f64::from(divider) } else { INTERNAL_CLOCK_HZ / f64::from(divider) }
     }
 
     /// Conversions start again, or stop.
     fn begin(&mut self) {
         let ticks = |clocks: f64| clocks / self.reference_hz() * f64::from(CLOCK_FREQ);
-        let conversion = ticks(16.0 * f64::from(self.get(RCOUNT0)) + 4.0);
-        let settling = ticks(16.0 * f64::from(self.get(SETTLECOUNT0)));
-        let asleep = self.get(CONFIG) & SLEEP_MODE_EN != 0;
+        let conversion = ticks(16.0 * f64::from(self.registers.get(RCOUNT0)) + 4.0);
+        let settling = ticks(16.0 * f64::from(self.registers.get(SETTLECOUNT0)));
+        let asleep = self.registers.get(CONFIG) & SLEEP_MODE_EN != 0;
         let first = self.clock.now().ticks() + (settling + conversion) as u64;
         self.conversions = Conversions {
             first: Clock::from_ticks(first),
             period: if asleep { 0.0 } else { conversion },
             seen: 0,
-            reported: self.get(ERROR_CONFIG) & DRDY_2INT != 0 && self.get(CONFIG) & INTB_DIS == 0,
+            reported: self.registers.get(ERROR_CONFIG) & DRDY_2INT != 0 && self.registers.get(CONFIG) & INTB_DIS == 0,
         };
         self.read = 0;
         self.intb.set(self.conversions);
-        if !asleep && self.get(CONFIG) & AUTO_AMP_DIS == 0 {
+        if !asleep && self.registers.get(CONFIG) & AUTO_AMP_DIS == 0 {
             // INIT_IDRIVE: the current that the chip found.
             let found = self.coil.config.drive_current << 6;
-            let current = &mut self.registers[usize::from(DRIVE_CURRENT0)];
-            *current = *current & 0xf800 | found;
+            self.registers.set(DRIVE_CURRENT0, self.registers.get(DRIVE_CURRENT0) & 0xf800 | found);
         }
     }
 
     /// DATA0 of a finished conversion.
     fn convert(&mut self) -> u32 {
-        let errors = self.get(ERROR_CONFIG);
+        let errors = self.registers.get(ERROR_CONFIG);
         let suits = self.coil.config.drive_current;
-        let current = if self.get(CONFIG) & RP_OVERRIDE_EN != 0 { self.get(DRIVE_CURRENT0) >> 11 } else { suits };
+        let current = if self.registers.get(CONFIG) & RP_OVERRIDE_EN != 0 {
+            self.registers.get(DRIVE_CURRENT0) >> 11
+        } else {
+            suits
+        };
         let let_out = |flag: u32, bits: u16| if errors & bits != 0 { flag } else { 0 };
         // Without a current the coil does not oscillate. Half to twice the suitable current is enough for it.
         if current == 0 {
@@ -306,13 +285,13 @@ impl Ldc1612 {
         if current > 2 * suits {
             flags |= let_out(ERR_AE, AH_ERR2OUT);
         }
-        let divider = (self.get(CLOCK_DIVIDERS0) >> 12).max(1);
+        let divider = (self.registers.get(CLOCK_DIVIDERS0) >> 12).max(1);
         let share = self.coil.hz() / f64::from(divider) / self.reference_hz();
         // The input must be below a quarter of the reference.
         if share >= 0.25 {
             flags |= let_out(ERR_OR, OR_ERR2OUT);
         }
-        let offset = f64::from(self.get(OFFSET0)) * 4096.0;
+        let offset = f64::from(self.registers.get(OFFSET0)) * 4096.0;
         let data = (share * 268_435_456.0 - offset).round().clamp(0.0, 268_435_455.0);
         flags | data as u32
     }
@@ -337,52 +316,45 @@ impl Ldc1612 {
                 self.intb.set(self.conversions);
                 ready | unread
             }
-            _ => self.get(address),
+            _ => self.registers.read(address),
         }
     }
 
     fn put(&mut self, address: u8, value: u16) {
-        if address == RESET_DEV && value & RESET_DEV_BIT != 0 {
-            return self.reset();
+        self.registers.write(address, value);
+        if self.registers.is_set(RESET_DEV, RESET_DEV_BIT) {
+            self.registers = RegisterMap::new(REGISTERS);
+            self.begin();
         }
-        let Some((_, bits, _)) = REGISTERS.iter().find(|(other, ..)| *other == address) else { return };
-        let register = &mut self.registers[usize::from(address)];
-        *register = *register & !bits | value & bits;
         if [RCOUNT0, SETTLECOUNT0, CLOCK_DIVIDERS0, ERROR_CONFIG, CONFIG].contains(&address) {
             self.begin();
         }
     }
 }
 
-impl I2cChip for Ldc1612 {
-    fn start(&mut self, read: bool) -> bool {
-        if read {
-            self.word = self.fetch(self.pointer);
-        }
-        self.bytes = 0;
-        true
+/// Each register has two bytes, at twice its address.
+impl RegisterChip for Ldc1612 {
+    fn register(&mut self, first: u8, _is_spi: bool) -> (u8, bool) {
+        (first << 1, true)
     }
 
-    fn write(&mut self, byte: u8) -> bool {
-        match self.bytes {
-            0 => self.pointer = byte & 0x7f,
-            _ => self.word = self.word << 8 | u16::from(byte),
+    fn read(&mut self, at: u8) -> u8 {
+        if at & 1 == 0 {
+            self.word = self.fetch(at >> 1);
         }
-        self.bytes += 1;
-        if self.bytes == 3 {
-            self.put(self.pointer, self.word);
-        }
-        true
+        self.word.to_be_bytes()[usize::from(at & 1)]
     }
 
-    fn read(&mut self) -> u8 {
-        let byte = match self.bytes {
-            0 => (self.word >> 8) as u8,
-            1 => self.word as u8,
-            _ => 0xff,
-        };
-        self.bytes += 1;
-        byte
+    fn write(&mut self, at: u8, value: u8) {
+        self.word = self.word << 8 | u16::from(value);
+        if at & 1 != 0 {
+            self.put(at >> 1, self.word);
+        }
+    }
+
+    /// A message stays at its register.
+    fn next(&mut self, at: u8) -> u8 {
+        at ^ 1
     }
 }
 
@@ -390,6 +362,7 @@ impl I2cChip for Ldc1612 {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::i2c::I2cChip;
     use crate::engine::motion::Axis;
     use pinion_firmware::time::VirtualClock;
 
@@ -397,7 +370,7 @@ mod tests {
         z: Arc<Axis>,
         clock: VirtualClock,
         intb: Arc<ReadyLine>,
-        chip: Ldc1612,
+        chip: OnBus<Ldc1612>,
     }
 
     impl Bench {
@@ -422,7 +395,7 @@ mod tests {
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let intb = ReadyLine::new("intb");
             let coil = Coil { config, bed, noise: Noise::of("coil", 1) };
-            let chip = Ldc1612::new(coil, intb.clone(), Arc::new(clock.clone()));
+            let chip = OnBus::new(Ldc1612::new(coil, intb.clone(), Arc::new(clock.clone())));
             Bench { z, clock, intb, chip }
         }
 

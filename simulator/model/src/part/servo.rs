@@ -14,6 +14,7 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::description::whole;
 use crate::engine::look::Look;
 use crate::engine::seqlock::Seqlock;
 use crate::engine::time::seconds;
@@ -32,33 +33,17 @@ pub struct ServoConfig {
     /// High during a pulse.
     pub pin: PinName,
     /// The pulse for 0 degrees.
-    #[serde(default = "default_min_pulse_us")]
+    #[serde(default = "whole::<1000, _>")]
     pub min_pulse_us: f64,
     /// The pulse for the other stop.
-    #[serde(default = "default_max_pulse_us")]
+    #[serde(default = "whole::<2000, _>")]
     pub max_pulse_us: f64,
     /// The angle of the other stop.
-    #[serde(default = "default_travel_degrees")]
+    #[serde(default = "whole::<180, _>")]
     pub travel_degrees: f64,
     /// Its speed.
-    #[serde(default = "default_degrees_per_s")]
+    #[serde(default = "whole::<500, _>")]
     pub degrees_per_s: f64,
-}
-
-fn default_min_pulse_us() -> f64 {
-    1000.0
-}
-
-fn default_max_pulse_us() -> f64 {
-    2000.0
-}
-
-fn default_travel_degrees() -> f64 {
-    180.0
-}
-
-fn default_degrees_per_s() -> f64 {
-    500.0
 }
 
 impl Part for ServoConfig {

@@ -15,6 +15,7 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::description::whole;
 use crate::engine::physics::Heater;
 use crate::engine::spi::SpiChip;
 use crate::klippy::layout::Layout;
@@ -36,28 +37,16 @@ pub struct ThermocoupleConfig {
     /// The heater that its sensor is in.
     pub heater: String,
     /// Temperature of the chip itself.
-    #[serde(default = "default_chip_celsius")]
+    #[serde(default = "whole::<25, _>")]
     pub chip_celsius: f64,
     /// The fault of the sensor, if it has one.
     pub fault: Option<SensorFault>,
     /// The platinum resistor's resistance at 0 °C (MAX31865).
-    #[serde(default = "default_rtd_ohm")]
+    #[serde(default = "whole::<100, _>")]
     pub rtd_ohm: f64,
     /// The reference resistor (MAX31865).
-    #[serde(default = "default_reference_ohm")]
+    #[serde(default = "whole::<430, _>")]
     pub reference_ohm: f64,
-}
-
-fn default_chip_celsius() -> f64 {
-    25.0
-}
-
-fn default_rtd_ohm() -> f64 {
-    100.0
-}
-
-fn default_reference_ohm() -> f64 {
-    430.0
 }
 
 /// The chips.
@@ -133,7 +122,7 @@ impl Part for ThermocoupleConfig {
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
-            let cause = format!("what a {} makes of that is not known", self.chip.name());
+            let cause = format!("the answer of a {} to it is unknown", self.chip.name());
             return wrong(whose, "fault", &cause, "choose `open` or `shorted`");
         }
         check(whose, "chip_celsius", self.chip_celsius, Bound::Any)?;

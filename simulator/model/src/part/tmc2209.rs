@@ -16,8 +16,8 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::trinamic::registers::{
-    CHOPCONF, DRV_STATUS, GCONF, IFCNT, MSCNT, MSCURACT, PWM_AUTO, Registers, SG_RESULT, SGTHRS, SLAVECONF, TCOOLTHRS,
-    TPWMTHRS, TSTEP, UART_IOIN as IOIN,
+    CHOPCONF, DRV_STATUS, GCONF, IFCNT, MSCNT, MSCURACT, PWM_AUTO, SG_RESULT, SGTHRS, SLAVECONF, TCOOLTHRS, TPWMTHRS,
+    TSTEP, UART_IOIN as IOIN, current, has_both_edges, mres, of_model, pwm_auto,
 };
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
@@ -28,6 +28,7 @@ use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
+use crate::engine::register_map::RegisterMap;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
@@ -114,14 +115,14 @@ impl<const MODEL: u16> Part for UartDriverConfig<MODEL> {
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         let (most, range) = if MODEL == 2209 { (3, "0 to 3") } else { (0, "0") };
         if self.address > most {
-            return wrong(whose, "address", &format!("{} is none", self.address), &format!("give {range}"));
+            return wrong(whose, "address", &format!("{} is not an address", self.address), &format!("give {range}"));
         }
         if !(1..=SG_MAX).contains(&self.sg_free) {
-            return wrong(whose, "sg_free", &format!("{} is no SG_RESULT", self.sg_free), "give 1 to 511");
+            return wrong(whose, "sg_free", &format!("{} is not an SG_RESULT", self.sg_free), "give 1 to 511");
         }
         match (&self.uart_pin, &self.uart_port) {
             (None, None) => return wrong(whose, "uart_pin", "it has none", "add it, or `uart_port`"),
-            (Some(_), Some(_)) => return wrong(whose, "uart_port", "it has a uart_pin, too", "remove one of them"),
+            (Some(_), Some(_)) => return wrong(whose, "uart_port", "it also has a uart_pin", "remove one of them"),
             _ => {}
         }
         if self.uart_port.is_some() && self.tx_pin.is_some() {
@@ -165,7 +166,7 @@ struct Tmc2209 {
     sg_free: u32,
     motor: Motor,
     diag: Arc<StallOutput>,
-    registers: Registers,
+    registers: RegisterMap<u32>,
     /// Number of messages that wrote a register.
     written: u8,
 }
@@ -173,7 +174,7 @@ struct Tmc2209 {
 impl Tmc2209 {
     /// The driver of an axis, at power-up.
     fn new(name: &str, model: u16, (address, sg_free): (u8, u32), axis: Arc<Axis>) -> Tmc2209 {
-        let registers = Registers::of(model);
+        let registers = of_model(model);
         let rule = stall_rule(&registers, sg_free, 0);
         let diag = Arc::new(StallOutput::new(name.to_owned(), axis.clone(), rule));
         let mut chip = Tmc2209 { model, address, sg_free, motor: Motor::new(axis), diag, registers, written: 0 };
@@ -184,7 +185,7 @@ impl Tmc2209 {
     /// Applies the registers.
     fn set_up(&mut self) {
         let mres = if self.registers.is_set(GCONF, GCONF_MSTEP_REG_SELECT) {
-            self.registers.mres()
+            mres(&self.registers)
         } else {
             // 8, 32, 64 and 16 microsteps by MS1 and MS2; 8, 2, 4 and 16 of a TMC2208.
             let by_pins = if self.model == 2208 { [5, 7, 6, 4] } else { [5, 3, 2, 4] };
@@ -197,7 +198,7 @@ impl Tmc2209 {
     }
 
     /// The value that a host reads at this instant.
-    fn read(&self, address: u8, now: Clock) -> u32 {
+    fn read(&mut self, address: u8, now: Clock) -> u32 {
         let stands = self.motor.tstep(now) == STANDSTILL;
         match address {
             IFCNT => self.written.into(),
@@ -217,9 +218,9 @@ impl Tmc2209 {
             DRV_STATUS => {
                 let spread = self.registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
                 let stealth = !spread && self.motor.tstep(now) >= self.registers.get(TPWMTHRS);
-                u32::from(stands) << 31 | u32::from(stealth) << 30 | self.registers.current(stands) << 16
+                u32::from(stands) << 31 | u32::from(stealth) << 30 | current(&self.registers, stands) << 16
             }
-            PWM_AUTO => self.registers.pwm_auto(),
+            PWM_AUTO => pwm_auto(&self.registers),
             _ => self.registers.read(address),
         }
     }
@@ -229,7 +230,7 @@ impl Tmc2209 {
         self.registers.write(address, data);
         self.set_up();
         if address == CHOPCONF {
-            self.motor.axis.set_both_edges(self.registers.has_both_edges());
+            self.motor.axis.set_both_edges(has_both_edges(&self.registers));
         }
     }
 }
@@ -254,7 +255,7 @@ impl UartChip for Tmc2209 {
 
 /// When DIAG reports a stall: SG_RESULT is at most twice SGTHRS, and the velocity is from TCOOLTHRS up to the start of
 /// SpreadCycle.
-fn stall_rule(registers: &Registers, sg_free: u32, mres: u32) -> StallRule {
+fn stall_rule(registers: &RegisterMap<u32>, sg_free: u32, mres: u32) -> StallRule {
     let fall = sg_free.saturating_sub(2 * registers.get(SGTHRS));
     let stealth = !registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
     StallRule {

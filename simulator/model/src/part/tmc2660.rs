@@ -16,7 +16,7 @@ use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
-use crate::engine::spi::SpiChip;
+use crate::engine::spi::{ShiftRegister, SpiChip};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::TimeSource;
@@ -75,14 +75,13 @@ struct Tmc2660 {
     motor: Motor,
     time: Arc<dyn TimeSource>,
     rdsel: u32,
-    /// The shift register of 20 bits, at the upper end.
-    shift: u32,
-    bytes: usize,
+    /// Its 20 bits, and four more of its message's last byte.
+    shift: ShiftRegister<3>,
 }
 
 impl Tmc2660 {
     fn new(axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc2660 {
-        Tmc2660 { motor: Motor::new(axis), time, rdsel: 0, shift: 0, bytes: 0 }
+        Tmc2660 { motor: Motor::new(axis), time, rdsel: 0, shift: ShiftRegister::load([0; 3]) }
     }
 
     /// The 20 bits of the answer.
@@ -119,21 +118,17 @@ impl SpiChip for Tmc2660 {
     }
 
     fn select(&mut self, _rate_hz: u32) {
-        self.shift = self.answer() << 12;
-        self.bytes = 0;
+        let [_, answer @ ..] = (self.answer() << 4).to_be_bytes();
+        self.shift = ShiftRegister::load(answer);
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
-        let [out, ..] = self.shift.to_be_bytes();
-        // Bits after the answer's 20 bits stand at the end of the datagram.
-        self.shift = self.shift << 8 | u32::from(byte);
-        self.bytes += 1;
-        out
+        self.shift.exchange(byte)
     }
 
     fn deselect(&mut self) {
-        if self.bytes >= 3 {
-            self.take(self.shift & 0xf_ffff);
+        if let Some([high, middle, low]) = self.shift.message() {
+            self.take(u32::from_be_bytes([0, high & 0x0f, middle, low]));
         }
     }
 }

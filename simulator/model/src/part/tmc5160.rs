@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::trinamic::registers::{
     CHOPCONF, COOLCONF, DRV_STATUS, GCONF, GSTAT, IFCNT, MSCNT, MSCURACT, MSLUT, MSLUTSEL, MSLUTSTART, PWM_AUTO,
-    Registers, SLAVECONF, SPI_IOIN as IOIN, TCOOLTHRS, TPWMTHRS, TSTEP,
+    SLAVECONF, SPI_IOIN as IOIN, TCOOLTHRS, TPWMTHRS, TSTEP, current, has_both_edges, mres, of_model, pwm_auto,
 };
 use super::trinamic::{
     FULL_LOAD, Motor, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out, offer_sensorless_homing,
@@ -31,14 +31,14 @@ use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::motion::Axis;
-use crate::engine::spi::SpiChip;
+use crate::engine::register_map::RegisterMap;
+use crate::engine::spi::{ShiftRegister, SpiChip};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{Clock, TimeSource};
 
 /// CPOL and CPHA are 1.
 const MODE: u8 = 3;
-const DATAGRAM_BYTES: usize = 5;
 const WRITE: u8 = 0x80;
 
 /// IOIN: VERSION, and SD_MODE, which is wired high for the step and direction mode.
@@ -203,7 +203,7 @@ impl Part for Tmc2240UartConfig {
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.address > 7 {
-            return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 7");
+            return wrong(whose, "address", &format!("{} is not an address", self.address), "give 0 to 7");
         }
         check_pins(whose, self.uart_pins())?;
         check_sg_free(whose, self.sg_free)?;
@@ -246,7 +246,7 @@ fn stall_output(cfg: &mut Sections, layout: &Layout<'_>, driver: &str, axis: &st
 fn check_sg_free(whose: &str, sg_free: i32) -> Result<(), Trouble> {
     match sg_free {
         -1000..=1000 => Ok(()),
-        _ => wrong(whose, "sg_free", &format!("{sg_free} is no SG_RESULT"), "give -1000 to 1000"),
+        _ => wrong(whose, "sg_free", &format!("{sg_free} is not an SG_RESULT"), "give -1000 to 1000"),
     }
 }
 
@@ -258,10 +258,8 @@ struct Tmc5160 {
     time: Arc<dyn TimeSource>,
     /// DIAG0 and DIAG1.
     diag: [Arc<StallOutput>; 2],
-    registers: Registers,
-    /// The shift register of 40 bits; the next field counts the bytes since the chip was selected.
-    shift: u64,
-    bytes: usize,
+    registers: RegisterMap<u32>,
+    shift: ShiftRegister<5>,
     /// The data that the next datagram returns.
     reply: u32,
     /// Its address on the UART, and the number of messages that wrote a register.
@@ -272,12 +270,12 @@ struct Tmc5160 {
 impl Tmc5160 {
     /// The driver of an axis, at power-up.
     fn new(name: String, (model, sg_free): (u16, i32), axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
-        let registers = Registers::of(model);
+        let registers = of_model(model);
         let diag = [0, 1]
             .map(|pin| Arc::new(StallOutput::new(name.clone(), axis.clone(), stall_rule(&registers, sg_free, pin))));
         let motor = Motor::new(axis);
-        let (shift, bytes, reply, address, written) = (0, 0, 0, 0, 0);
-        let mut chip = Tmc5160 { model, sg_free, motor, time, diag, registers, shift, bytes, reply, address, written };
+        let (shift, reply, address, written) = (ShiftRegister::load([0; 5]), 0, 0, 0);
+        let mut chip = Tmc5160 { model, sg_free, motor, time, diag, registers, shift, reply, address, written };
         chip.set_up_motor();
         chip
     }
@@ -290,11 +288,11 @@ impl Tmc5160 {
     }
 
     fn set_up_motor(&mut self) {
-        self.motor.set_up(self.registers.mres(), self.registers.is_set(GCONF, GCONF_SHAFT));
+        self.motor.set_up(mres(&self.registers), self.registers.is_set(GCONF, GCONF_SHAFT));
     }
 
     /// The value that a host reads.
-    fn read(&self, address: u8) -> u32 {
+    fn read(&mut self, address: u8) -> u32 {
         let now = self.time.now();
         match address {
             IOIN => {
@@ -317,7 +315,7 @@ impl Tmc5160 {
                 self.motor.currents(&Wave { increments, segments, start })
             }
             DRV_STATUS => self.drv_status(now),
-            PWM_AUTO if self.model != 2130 => self.registers.pwm_auto(),
+            PWM_AUTO if self.model != 2130 => pwm_auto(&self.registers),
             _ => self.registers.read(address),
         }
     }
@@ -326,7 +324,7 @@ impl Tmc5160 {
         self.registers.write(address, data);
         if matches!(address, GCONF | CHOPCONF) {
             self.set_up_motor();
-            self.motor.axis.set_both_edges(self.registers.has_both_edges());
+            self.motor.axis.set_both_edges(has_both_edges(&self.registers));
         }
         for (pin, diag) in self.diag.iter().enumerate() {
             diag.set(stall_rule(&self.registers, self.sg_free, pin));
@@ -337,7 +335,7 @@ impl Tmc5160 {
         let tstep = self.motor.tstep(now);
         let stands = tstep == STANDSTILL;
         let stealth = self.registers.is_set(GCONF, GCONF_EN_PWM_MODE) && tstep >= self.registers.get(TPWMTHRS);
-        let mut status = u32::from(stands) << 31 | self.registers.current(stands) << 16 | u32::from(stealth) << 14;
+        let mut status = u32::from(stands) << 31 | current(&self.registers, stands) << 16 | u32::from(stealth) << 14;
         // Only SpreadCycle measures the load.
         if !stealth && !stands {
             let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
@@ -358,13 +356,13 @@ impl Tmc5160 {
 }
 
 /// SGT of COOLCONF, a signed number.
-fn sgt(registers: &Registers) -> i32 {
+fn sgt(registers: &RegisterMap<u32>) -> i32 {
     let bits = (registers.get(COOLCONF) >> 16 & 0x7f) as i32;
     if bits < 0x40 { bits } else { bits - 0x80 }
 }
 
 /// When DIAG0 or DIAG1 reports a stall: SG_RESULT is 0, the velocity is at least TCOOLTHRS, and SpreadCycle is in use.
-fn stall_rule(registers: &Registers, sg_free: i32, pin: usize) -> StallRule {
+fn stall_rule(registers: &RegisterMap<u32>, sg_free: i32, pin: usize) -> StallRule {
     let is_set = |bit| registers.is_set(GCONF, bit);
     // The lowest load at which SG_RESULT is 0.
     let load = (sg_free + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
@@ -374,7 +372,7 @@ fn stall_rule(registers: &Registers, sg_free: i32, pin: usize) -> StallRule {
         least_load: (is_set(GCONF_DIAG_STALL[pin]) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
         fastest: 0,
         slowest: registers.get(TCOOLTHRS).min(stealth_from.saturating_sub(1)),
-        mres: registers.mres().min(8),
+        mres: mres(registers).min(8),
         push_pull: is_set(GCONF_DIAG_PUSHPULL[pin]),
     }
 }
@@ -405,32 +403,21 @@ impl SpiChip for Tmc5160 {
     }
 
     fn select(&mut self, _rate_hz: u32) {
-        self.shift = u64::from(self.status()) << 32 | u64::from(self.reply);
-        self.bytes = 0;
+        let [d3, d2, d1, d0] = self.reply.to_be_bytes();
+        self.shift = ShiftRegister::load([self.status(), d3, d2, d1, d0]);
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
-        let [.., out, _, _, _, _] = self.shift.to_be_bytes();
-        self.shift = self.shift << 8 | u64::from(byte);
-        self.bytes += 1;
-        out
+        self.shift.exchange(byte)
     }
 
     /// Only the last 40 bits of a longer datagram count. The others belong to chips behind this one in a chain. A
     /// shorter datagram has no effect.
     fn deselect(&mut self) {
-        if self.bytes < DATAGRAM_BYTES {
-            return;
-        }
-        let [.., address, d3, d2, d1, d0] = self.shift.to_be_bytes();
+        let Some([address, d3, d2, d1, d0]) = self.shift.message() else { return };
         let data = u32::from_be_bytes([d3, d2, d1, d0]);
         self.reply = if address & WRITE == 0 {
-            let value = self.read(address);
-            // Reading clears the flags of a TMC2130. The others want a one to be written.
-            if self.model == 2130 && address == GSTAT {
-                self.registers.write(GSTAT, value);
-            }
-            value
+            self.read(address)
         } else {
             self.write(address & !WRITE, data);
             data

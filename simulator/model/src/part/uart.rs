@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, TryLockError};
 
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
+use crate::engine::crc;
 use crate::engine::serial::SerialChip;
 use crate::engine::wire::{Kind, LevelLine, Wire};
 use crate::klippy::sections::Sections;
@@ -30,12 +31,7 @@ const LONGEST_BIT: u64 = CLOCK_FREQ as u64 / 9000;
 
 /// CRC8-ATM, each byte from its lowest bit on ("CRC Calculation").
 pub(crate) fn crc8(bytes: &[u8]) -> u8 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(crc, |crc: u8, bit| {
-            let carry = (crc >> 7) ^ (byte >> bit & 1);
-            (crc << 1) ^ (carry * 0x07)
-        })
-    })
+    crc::crc8(0x07, 0, bytes.iter().map(|byte| byte.reverse_bits()))
 }
 
 /// Whether these are all bytes of a message.
@@ -115,7 +111,7 @@ pub(crate) fn check_pins<'a>(
     pins: impl IntoIterator<Item = (&'static str, Option<&'a PinName>)>,
 ) -> Result<(), Trouble> {
     let inverted = pins.into_iter().find(|(_, pin)| pin.is_some_and(|pin| pin.inverted));
-    inverted.map_or(Ok(()), |(key, _)| wrong(whose, key, "klippy inverts no UART", "remove the `!`"))
+    inverted.map_or(Ok(()), |(key, _)| wrong(whose, key, "klippy cannot invert a UART", "remove the `!`"))
 }
 
 /// The keys for the lines of a multiplexer.

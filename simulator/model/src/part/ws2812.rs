@@ -66,7 +66,7 @@ impl Part for Ws2812Config {
         let mut letters: Vec<char> = self.color_order.chars().collect();
         letters.sort_unstable();
         if letters != ['B', 'G', 'R'] && letters != ['B', 'G', 'R', 'W'] {
-            let cause = format!("`{}` is no order", self.color_order);
+            let cause = format!("`{}` is not an order of colors", self.color_order);
             return wrong(whose, "color_order", &cause, "such as GRB or GRBW");
         }
         Ok(())

@@ -92,7 +92,7 @@ grep -c firmware_restart /run/add/requests >/run/add/restarts
 on_card adxl345 --yes --moonraker 127.0.0.1:7126 | grep 'Nothing is left to change'
 same /run/add/after
 is "$(grep -c firmware_restart /run/add/requests)" "$(cat /run/add/restarts)" "the number of restarts"
-on_card adxl345 --undo --yes --moonraker 127.0.0.1:7126 | grep 'The host has restarted without it'
+on_card adxl345 --undo --yes --moonraker 127.0.0.1:7126 | grep 'The host has restarted without the device'
 same /run/add/before
 says / | not grep adxl345
 rm -r /run/add

@@ -18,8 +18,8 @@ until_true 10 pgrep -u stranger -f klippy.py
 until_true 10 pgrep -u stranger -f klipper_mcu
 until_true 10 pgrep -u stranger -f agetty
 advice >/run/advice-after
-grep 'have processes with the names of a Pinion or a klippy, which do not count here: ' /run/advice-after
-is "$(grep -v -e 'which do not count here: ' -e 'if one of them is yours, have a service start it' /run/advice-after)" \
+grep 'are called like a Pinion or a klippy, and do not count here: ' /run/advice-after
+is "$(grep -v -e 'and do not count here: ' -e 'if one of them is yours, have a service start it' /run/advice-after)" \
     "$(cat /run/advice-before)" "doctor's advice"
 pkill -u stranger
 wait || true

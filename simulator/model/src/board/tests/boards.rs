@@ -103,7 +103,7 @@ fn a_pin_of_a_board_that_is_not_there_is_refused() {
     let error = SimConfig::parse(&BOARDS.replace("!toolhead:gpio3", "toolhed:gpio3"), "boards").unwrap_err();
     assert!(error.to_string().contains("pin `toolhed:gpio3` is on no board"), "{error}");
     let error = SimConfig::parse(&BOARDS.replace("mcu:PA1", "mcu:PA0"), "boards").unwrap_err();
-    assert!(error.to_string().contains("has a use already"), "{error}");
+    assert!(error.to_string().contains("already has a use"), "{error}");
 }
 
 #[test]

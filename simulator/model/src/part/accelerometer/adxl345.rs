@@ -7,8 +7,8 @@
 //! sleep and self test, the trigger mode (it works like the stream mode) and the interrupt pins (INT_SOURCE has the
 //! same bits).
 
-use super::Chip;
 use super::head::{Fifo, Head, Room};
+use crate::engine::register_map::{Access, Register, RegisterChip, RegisterMap};
 
 /// CPOL and CPHA are 1.
 const MODE: u8 = 3;
@@ -17,7 +17,6 @@ const MULTIPLE_BYTES: u8 = 0x40;
 const ADDRESS: u8 = 0x3f;
 
 const DEVID: u8 = 0x00;
-const THRESH_TAP: u8 = 0x1d;
 const OFSX: u8 = 0x1e;
 const ACT_TAP_STATUS: u8 = 0x2b;
 const BW_RATE: u8 = 0x2c;
@@ -29,9 +28,12 @@ const DATAZ1: u8 = 0x37;
 const FIFO_CTL: u8 = 0x38;
 const FIFO_STATUS: u8 = 0x39;
 
-const DEVICE_ID: u8 = 0xe5;
-/// 100 samples a second.
-const BW_RATE_RESET: u8 = 0x0a;
+/// The registers that do not only hold what is written. BW_RATE starts with 100 samples a second.
+const REGISTERS: &[Register<u8>] = &[
+    Register(DEVID, Access::Read, 0, 0xe5),
+    Register(ACT_TAP_STATUS, Access::Read, 0, 0),
+    Register(BW_RATE, Access::ReadWrite, 0xff, 0x0a),
+];
 const MEASURE: u8 = 0x08;
 const FULL_RES: u8 = 0x08;
 const JUSTIFY: u8 = 0x04;
@@ -52,8 +54,7 @@ const LSB_PER_OFFSET: f64 = 4.0;
 /// The chip's registers and its FIFO.
 pub(super) struct Adxl345 {
     head: Head,
-    /// By address; only the registers that hold what is written.
-    registers: [u8; 0x40],
+    registers: RegisterMap<u8>,
     fifo: Fifo,
     /// Whether a data register was read. The sample leaves when the read moves beyond the data registers or ends.
     data_read: bool,
@@ -63,22 +64,21 @@ pub(super) struct Adxl345 {
 
 impl Adxl345 {
     pub(super) fn new(head: Head) -> Adxl345 {
-        let mut registers = [0; 0x40];
-        registers[usize::from(DEVID)] = DEVICE_ID;
-        registers[usize::from(BW_RATE)] = BW_RATE_RESET;
-        Adxl345 { head, registers, fifo: Fifo::new(FIFO + 1), data_read: false, status: 0 }
-    }
-
-    fn get(&self, register: u8) -> u8 {
-        self.registers[usize::from(register & ADDRESS)]
+        Adxl345 {
+            head,
+            registers: RegisterMap::holding(0x40, REGISTERS),
+            fifo: Fifo::new(FIFO + 1),
+            data_read: false,
+            status: 0,
+        }
     }
 
     fn rate_hz(&self) -> f64 {
-        TOP_RATE_HZ / f64::from(1u32 << (15 - (self.get(BW_RATE) & 0x0f)))
+        TOP_RATE_HZ / f64::from(1u32 << (15 - (self.registers.get(BW_RATE) & 0x0f)))
     }
 
     fn room(&self) -> Room {
-        match self.get(FIFO_CTL) >> 6 {
+        match self.registers.get(FIFO_CTL) >> 6 {
             0 => Room { samples: 1, replaces: true },
             1 => Room { samples: FIFO + 1, replaces: false },
             _ => Room { samples: FIFO + 1, replaces: true },
@@ -87,8 +87,8 @@ impl Adxl345 {
 
     /// Takes the samples that have become due.
     fn catch_up(&mut self) {
-        let offsets = [0, 1, 2].map(|i| f64::from(self.get(OFSX + i) as i8) * LSB_PER_OFFSET);
-        let (format, room) = (self.get(DATA_FORMAT), self.room());
+        let offsets = [0, 1, 2].map(|i| f64::from(self.registers.get(OFSX + i) as i8) * LSB_PER_OFFSET);
+        let (format, room) = (self.registers.get(DATA_FORMAT), self.room());
         self.head.catch_up(&mut self.fifo, room, |g| digitize(format, offsets, g));
     }
 
@@ -117,10 +117,10 @@ fn digitize(format: u8, offsets: [f64; 3], g: [f64; 3]) -> [i16; 3] {
     })
 }
 
-impl Chip for Adxl345 {
+impl RegisterChip for Adxl345 {
     const SPI_MODES: &'static [u8] = &[MODE];
 
-    fn register(&self, first: u8, _is_spi: bool) -> (u8, bool) {
+    fn register(&mut self, first: u8, _is_spi: bool) -> (u8, bool) {
         (first & ADDRESS, first & MULTIPLE_BYTES != 0)
     }
 
@@ -139,23 +139,19 @@ impl Chip for Adxl345 {
             }
             INT_SOURCE => {
                 let ready = if self.fifo.samples.is_empty() { 0 } else { DATA_READY };
-                let watermark = if self.entries() >= self.get(FIFO_CTL) & 0x1f { WATERMARK } else { 0 };
+                let watermark = if self.entries() >= self.registers.get(FIFO_CTL) & 0x1f { WATERMARK } else { 0 };
                 ready | watermark | if self.fifo.overrun { OVERRUN } else { 0 }
             }
             FIFO_STATUS => self.status,
-            _ => self.get(register),
+            _ => self.registers.read(register),
         }
     }
 
     fn write(&mut self, register: u8, value: u8) {
-        if matches!(register, THRESH_TAP..=FIFO_CTL)
-            && !matches!(register, ACT_TAP_STATUS | INT_SOURCE | DATAX0..=DATAZ1)
-        {
-            self.registers[usize::from(register)] = value;
-        }
+        self.registers.write(register, value);
         match register {
             POWER_CTL | BW_RATE => {
-                let measures = self.get(POWER_CTL) & MEASURE != 0;
+                let measures = self.registers.get(POWER_CTL) & MEASURE != 0;
                 self.head.measure(measures.then(|| self.rate_hz()));
             }
             // The bypass mode empties the FIFO.
@@ -179,10 +175,11 @@ impl Chip for Adxl345 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::READ;
     use super::super::head::{DELAY_TICKS, G_MM_PER_S2, TURN_ON_S};
-    use super::super::tests::{Bench, DAMPING, X_HZ};
+    use super::super::tests::{Bench, DAMPING, READ, X_HZ};
     use super::*;
+
+    const THRESH_TAP: u8 = 0x1d;
     use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource as _};
     use std::f64::consts::TAU;
 

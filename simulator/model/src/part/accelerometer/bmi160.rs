@@ -5,8 +5,8 @@
 //! registers hold what is written. Not simulated: gyroscope, headers, filters, interrupts, the choice of the bus by its
 //! first message.
 
-use super::Chip;
 use super::head::{Fifo, Head, Room, SAMPLE, value};
+use crate::engine::register_map::{Access, Register, RegisterChip, RegisterMap};
 
 const CHIP_ID: u8 = 0x00;
 const ID: u8 = 0xd1;
@@ -29,55 +29,52 @@ const FIFO_HEADER: u8 = 0x10;
 const NORMAL: u8 = 0x10;
 /// Bytes of the FIFO.
 const FIFO: usize = 1024;
-/// Registers that do not start as zero.
-const RESETS: [(u8, u8); 6] =
-    [(CHIP_ID, ID), (ACC_CONF, 0x28), (ACC_RANGE, 0x03), (0x45, 0x88), (0x46, 0x80), (FIFO_CONFIG_1, FIFO_HEADER)];
+/// The registers that do not only hold what is written, or do not start as zero.
+const REGISTERS: &[Register<u8>] = &[
+    Register(CHIP_ID, Access::Read, 0, ID),
+    Register(PMU_STATUS, Access::Read, 0, 0),
+    Register(ACC_CONF, Access::ReadWrite, 0xff, 0x28),
+    Register(ACC_RANGE, Access::ReadWrite, 0xff, 0x03),
+    Register(0x45, Access::ReadWrite, 0xff, 0x88), // FIFO_DOWNS
+    Register(0x46, Access::ReadWrite, 0xff, 0x80), // FIFO_CONFIG_0
+    Register(FIFO_CONFIG_1, Access::ReadWrite, 0xff, FIFO_HEADER),
+];
 
 pub(super) struct Bmi160 {
     head: Head,
-    registers: [u8; 0x80],
+    registers: RegisterMap<u8>,
     fifo: Fifo,
 }
 
 impl Bmi160 {
     pub(super) fn new(head: Head) -> Bmi160 {
-        let mut registers = [0; 0x80];
-        RESETS.iter().for_each(|(register, reset)| registers[usize::from(*register)] = *reset);
-        Bmi160 { head, registers, fifo: Fifo::new(FIFO / SAMPLE) }
-    }
-
-    fn get(&self, register: u8) -> u8 {
-        self.registers[usize::from(register & 0x7f)]
+        Bmi160 { head, registers: RegisterMap::holding(0x80, REGISTERS), fifo: Fifo::new(FIFO / SAMPLE) }
     }
 
     fn catch_up(&mut self) {
         let room = Room { samples: FIFO / SAMPLE, replaces: true };
-        let lsb_per_g = match self.get(ACC_RANGE) & 0x0f {
+        let lsb_per_g = match self.registers.get(ACC_RANGE) & 0x0f {
             0x05 => 8192.0,
             0x08 => 4096.0,
             0x0c => 2048.0,
             _ => 16384.0,
         };
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
-        if self.get(FIFO_CONFIG_1) & (FIFO_ACC | FIFO_HEADER) != FIFO_ACC {
+        if self.registers.get(FIFO_CONFIG_1) & (FIFO_ACC | FIFO_HEADER) != FIFO_ACC {
             self.fifo.clear();
         }
     }
 
     fn set_up(&mut self) {
         // Code 8 is 100 samples a second, and each code doubles it.
-        let rate_hz = 100.0 * f64::from(1u32 << (self.get(ACC_CONF) & 0x0f)) / 256.0;
-        let is_on = self.get(PMU_STATUS) & NORMAL != 0;
+        let rate_hz = 100.0 * f64::from(1u32 << (self.registers.get(ACC_CONF) & 0x0f)) / 256.0;
+        let is_on = self.registers.get(PMU_STATUS) & NORMAL != 0;
         self.head.measure(is_on.then_some(rate_hz));
     }
 }
 
-impl Chip for Bmi160 {
+impl RegisterChip for Bmi160 {
     const SPI_MODES: &'static [u8] = &[0, 3];
-
-    fn register(&self, first: u8, _is_spi: bool) -> (u8, bool) {
-        (first & 0x7f, true)
-    }
 
     fn begin(&mut self) {
         self.catch_up();
@@ -89,24 +86,23 @@ impl Chip for Bmi160 {
             FIFO_LENGTH => low,
             register if register == FIFO_LENGTH + 1 => high,
             FIFO_DATA => self.fifo.next_byte(i16::to_le_bytes),
-            _ => self.get(register),
+            _ => self.registers.read(register),
         }
     }
 
     fn write(&mut self, register: u8, value: u8) {
         match (register, value) {
             (CMD, ACC_NORMAL | ACC_SUSPEND) => {
-                self.registers[usize::from(PMU_STATUS)] = if value == ACC_NORMAL { NORMAL } else { 0 };
+                self.registers.set(PMU_STATUS, if value == ACC_NORMAL { NORMAL } else { 0 });
                 self.set_up();
             }
             (CMD, FIFO_FLUSH) => self.fifo.clear(),
-            (ACC_CONF.., _) => {
-                self.registers[usize::from(register & 0x7f)] = value;
+            _ => {
+                self.registers.write(register, value);
                 if register == ACC_CONF {
                     self.set_up();
                 }
             }
-            _ => {}
         }
     }
 
@@ -118,9 +114,8 @@ impl Chip for Bmi160 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::READ;
     use super::super::head::TURN_ON_S;
-    use super::super::tests::Bench;
+    use super::super::tests::{Bench, READ};
     use super::*;
 
     /// klippy's writes before a measurement.

@@ -5,8 +5,8 @@
 //! Simulated: all registers; rates, ranges and resolutions, the FIFO and its status. Not simulated: filters, self test,
 //! interrupts and the events that cause them, single conversions, the temperature.
 
-use super::Chip;
 use super::head::{Fifo, Head, Room, value};
+use crate::engine::register_map::{Access, Register, RegisterChip, RegisterMap};
 
 const WHO_AM_I: u8 = 0x0f;
 const CTRL1: u8 = 0x20;
@@ -41,7 +41,7 @@ const FIFO: usize = 32;
 pub(super) struct Model {
     id: u8,
     /// Registers that do not start as zero.
-    resets: &'static [(u8, u8)],
+    resets: &'static [Register<u8>],
     /// Samples a second, by the code in CTRL1.
     rate_hz: fn(ctrl1: u8) -> f64,
     /// Of its 16 bits.
@@ -55,19 +55,15 @@ pub(super) struct Model {
     register: fn(&Registers, first: u8, is_spi: bool) -> (u8, bool),
 }
 
-type Registers = [u8; 0x80];
+type Registers = RegisterMap<u8>;
 
 const BYPASS: Room = Room { samples: 1, replaces: true };
 const STOPS: Room = Room { samples: FIFO, replaces: false };
 const STREAM: Room = Room { samples: FIFO, replaces: true };
 
-fn get(registers: &Registers, register: u8) -> u8 {
-    registers[usize::from(register & 0x7f)]
-}
-
 pub(super) const LIS2DW: Model = Model {
     id: 0x44,
-    resets: &[(CTRL2, IF_ADD_INC)],
+    resets: &[Register(CTRL2, Access::ReadWrite, 0xff, IF_ADD_INC)],
     rate_hz: |ctrl1| {
         let is_high_performance = ctrl1 >> 2 & 3 == 1;
         match ctrl1 >> 4 {
@@ -80,11 +76,11 @@ pub(super) const LIS2DW: Model = Model {
         }
     },
     // The first low-power mode has 12 bits.
-    resolution_bits: |registers| if get(registers, CTRL1) & 0x0f == 0 { 12 } else { 14 },
+    resolution_bits: |registers| if registers.get(CTRL1) & 0x0f == 0 { 12 } else { 14 },
     // 0.244 mg/digit of 14 bits at 2 g.
     lsb_per_g: [4.0 / 0.000_244, 4.0 / 0.000_488, 4.0 / 0.000_976, 4.0 / 0.001_952],
-    range: |registers| get(registers, CTRL6) >> 4 & 3,
-    room: |registers| match get(registers, FIFO_CTRL) >> 5 {
+    range: |registers| registers.get(CTRL6) >> 4 & 3,
+    room: |registers| match registers.get(FIFO_CTRL) >> 5 {
         0 => BYPASS,
         1 => STOPS,
         _ => STREAM,
@@ -94,13 +90,13 @@ pub(super) const LIS2DW: Model = Model {
         let reached = if entries >= threshold { FIFO_THRESHOLD } else { 0 };
         reached | entries | if fifo.overrun { FIFO_OVERRUN } else { 0 }
     },
-    register: |registers, first, _| (first & 0x7f, get(registers, CTRL2) & IF_ADD_INC != 0),
+    register: |registers, first, _| (first & 0x7f, registers.get(CTRL2) & IF_ADD_INC != 0),
 };
 
 pub(super) const LIS3DH: Model = Model {
     id: 0x33,
     // The axes are enabled.
-    resets: &[(CTRL1, 0x07)],
+    resets: &[Register(CTRL1, Access::ReadWrite, 0xff, 0x07)],
     rate_hz: |ctrl1| match (ctrl1 >> 4, ctrl1 & LP_EN != 0) {
         (0, _) => 0.0,
         (1, _) => 1.0,
@@ -110,16 +106,16 @@ pub(super) const LIS3DH: Model = Model {
         (_, true) => 5376.0,
         (_, false) => 1344.0,
     },
-    resolution_bits: |registers| match (get(registers, CTRL1) & LP_EN, get(registers, CTRL4) & HR) {
+    resolution_bits: |registers| match (registers.get(CTRL1) & LP_EN, registers.get(CTRL4) & HR) {
         (0, 0) => 10,
         (0, _) => 12,
         _ => 8,
     },
     // 1, 2, 4 and 11.72 mg/digit of 12 bits.
     lsb_per_g: [16.0 / 0.001, 16.0 / 0.002, 16.0 / 0.004, 16.0 / 0.011_72],
-    range: |registers| get(registers, CTRL4) >> 4 & 3,
-    room: |registers| match get(registers, FIFO_CTRL) >> 6 {
-        _ if get(registers, CTRL5) & FIFO_EN == 0 => BYPASS,
+    range: |registers| registers.get(CTRL4) >> 4 & 3,
+    room: |registers| match registers.get(FIFO_CTRL) >> 6 {
+        _ if registers.get(CTRL5) & FIFO_EN == 0 => BYPASS,
         0 => BYPASS,
         1 => STOPS,
         _ => STREAM,
@@ -144,11 +140,8 @@ pub(super) struct Lis {
 
 impl Lis {
     pub(super) fn new(model: &'static Model, head: Head) -> Lis {
-        let mut registers = [0; 0x80];
-        registers[usize::from(WHO_AM_I)] = model.id;
-        for (register, reset) in model.resets {
-            registers[usize::from(*register)] = *reset;
-        }
+        let mut registers = RegisterMap::holding(0x80, model.resets);
+        registers.add(&[Register(WHO_AM_I, Access::Read, 0, model.id)]);
         Lis { model, head, registers, fifo: Fifo::new(FIFO) }
     }
 
@@ -160,10 +153,10 @@ impl Lis {
     }
 }
 
-impl Chip for Lis {
+impl RegisterChip for Lis {
     const SPI_MODES: &'static [u8] = &[0, 3];
 
-    fn register(&self, first: u8, is_spi: bool) -> (u8, bool) {
+    fn register(&mut self, first: u8, is_spi: bool) -> (u8, bool) {
         (self.model.register)(&self.registers, first, is_spi)
     }
 
@@ -185,15 +178,13 @@ impl Chip for Lis {
                     0x0f
                 }
             }
-            FIFO_SAMPLES => (self.model.fifo_status)(&self.fifo, get(&self.registers, FIFO_CTRL) & 0x1f),
-            _ => get(&self.registers, register),
+            FIFO_SAMPLES => (self.model.fifo_status)(&self.fifo, self.registers.get(FIFO_CTRL) & 0x1f),
+            _ => self.registers.read(register),
         }
     }
 
     fn write(&mut self, register: u8, value: u8) {
-        if !matches!(register, WHO_AM_I | STATUS..=OUT_Z_H | FIFO_SAMPLES) {
-            self.registers[usize::from(register & 0x7f)] = value;
-        }
+        self.registers.write(register, value);
         match register {
             CTRL1 => {
                 let rate_hz = (self.model.rate_hz)(value);
@@ -216,9 +207,8 @@ impl Chip for Lis {
 
 #[cfg(test)]
 mod tests {
-    use super::super::READ;
     use super::super::head::TURN_ON_S;
-    use super::super::tests::Bench;
+    use super::super::tests::{Bench, READ};
     use super::*;
 
     /// A chip, its rate, 1 g, and registers with their values.

@@ -14,9 +14,8 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::i2c::I2cChip;
+use crate::engine::register_map::{OnBus, RegisterChip};
 use crate::engine::ring::{Ring, RingConfig};
-use crate::engine::spi::SpiChip;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 
@@ -96,8 +95,8 @@ impl AccelerometerConfig {
         [("x", self.x.as_ref()), ("y", self.y.as_ref()), ("z", self.z.as_ref())]
     }
 
-    fn solder<C: Chip + 'static>(&self, workshop: &mut Workshop<'_>, chip: C) {
-        let chip = OnBus { chip, message: Message::Start, many: false };
+    fn solder<C: RegisterChip + 'static>(&self, workshop: &mut Workshop<'_>, chip: C) {
+        let chip = OnBus::new(chip);
         match self.address {
             None => workshop.solder_spi(self, chip),
             Some(_) => workshop.solder_i2c(self, chip),
@@ -191,144 +190,22 @@ impl Part for AccelerometerConfig {
     }
 }
 
-/// A chip with registers.
-trait Chip: Send {
-    /// Its SPI modes.
-    const SPI_MODES: &'static [u8];
-
-    /// The register that the first byte of a message names, and whether the next bytes are of the registers after it.
-    fn register(&self, first: u8, is_spi: bool) -> (u8, bool);
-
-    /// A message begins.
-    fn begin(&mut self);
-
-    /// The value that a host reads.
-    fn read(&mut self, register: u8) -> u8;
-
-    /// A host writes a value.
-    fn write(&mut self, register: u8, value: u8);
-
-    /// The register after this one.
-    fn next(&mut self, register: u8) -> u8;
-
-    /// The message is over.
-    fn end(&mut self) {}
-}
-
-/// The state of a message.
-#[derive(Clone, Copy, PartialEq)]
-enum Message {
-    /// Waits for the first byte.
-    Start,
-    Read(u8),
-    Write(u8),
-}
-
-/// The first byte on SPI: the host reads.
-const READ: u8 = 0x80;
-
-/// A chip behind its bus.
-struct OnBus<C> {
-    chip: C,
-    message: Message,
-    many: bool,
-}
-
-impl<C: Chip> OnBus<C> {
-    fn next(&mut self, register: u8) -> u8 {
-        if self.many { self.chip.next(register) } else { register }
-    }
-
-    fn get(&mut self, register: u8) -> u8 {
-        let value = self.chip.read(register);
-        self.message = Message::Read(self.next(register));
-        value
-    }
-
-    fn set(&mut self, register: u8, value: u8) {
-        self.chip.write(register, value);
-        self.message = Message::Write(self.next(register));
-    }
-}
-
-impl<C: Chip> SpiChip for OnBus<C> {
-    fn knows_mode(&self, mode: u8) -> bool {
-        C::SPI_MODES.contains(&mode)
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.chip.begin();
-        self.message = Message::Start;
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        match self.message {
-            Message::Start => {
-                let register;
-                (register, self.many) = self.chip.register(byte & !READ, true);
-                self.message = if byte & READ == 0 { Message::Write(register) } else { Message::Read(register) };
-                0
-            }
-            Message::Read(register) => self.get(register),
-            Message::Write(register) => {
-                self.set(register, byte);
-                0
-            }
-        }
-    }
-
-    fn deselect(&mut self) {
-        self.chip.end();
-    }
-}
-
-impl<C: Chip> I2cChip for OnBus<C> {
-    fn start(&mut self, read: bool) -> bool {
-        self.chip.begin();
-        // A read goes on at the register that was written before.
-        self.message = match self.message {
-            Message::Read(register) | Message::Write(register) if read => Message::Read(register),
-            _ => Message::Start,
-        };
-        true
-    }
-
-    fn write(&mut self, byte: u8) -> bool {
-        match self.message {
-            Message::Write(register) => self.set(register, byte),
-            _ => {
-                let register;
-                (register, self.many) = self.chip.register(byte, false);
-                self.message = Message::Write(register);
-            }
-        }
-        true
-    }
-
-    fn read(&mut self) -> u8 {
-        match self.message {
-            Message::Read(register) => self.get(register),
-            _ => 0xff,
-        }
-    }
-
-    fn stop(&mut self) {
-        self.chip.end();
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
 
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::i2c::I2cChip;
     use crate::engine::motion::Axis;
     use crate::engine::noise::Noise;
+    use crate::engine::spi::SpiChip;
     use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource as _, VirtualClock};
 
     pub(super) const X_HZ: f64 = 57.0;
     pub(super) const DAMPING: f64 = 0.1;
+    /// The first byte on SPI: the host reads.
+    pub(super) const READ: u8 = 0x80;
 
     /// A chip without noise. Its x axis rings.
     pub(super) struct Bench<C> {
@@ -337,7 +214,7 @@ mod tests {
         pub(super) chip: OnBus<C>,
     }
 
-    impl<C: Chip> Bench<C> {
+    impl<C: RegisterChip> Bench<C> {
         pub(super) fn new(rate_off_percent: f64, chip: impl FnOnce(Head) -> C) -> Bench<C> {
             let clock = VirtualClock::at(Clock::from_ticks(1_000_000_000));
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
@@ -358,7 +235,7 @@ mod tests {
                 z: None,
             };
             let head = Head::new(&config, rings, Noise::of("accelerometer", 1), Arc::new(clock.clone()));
-            Bench { axis, clock, chip: OnBus { chip: chip(head), message: Message::Start, many: false } }
+            Bench { axis, clock, chip: OnBus::new(chip(head)) }
         }
 
         pub(super) fn wait(&self, seconds: f64) {

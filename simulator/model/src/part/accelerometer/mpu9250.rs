@@ -5,8 +5,8 @@
 //! Simulated: identification, sleep, rates, ranges, the FIFO with accelerations alone, its count and its overflow. Other
 //! registers hold what is written. Not simulated: gyroscope, magnetometer, temperature, filters, interrupts.
 
-use super::Chip;
 use super::head::{Fifo, Head, Room, SAMPLE, value};
+use crate::engine::register_map::{Access, Register, RegisterChip, RegisterMap};
 
 const SLEEP: u8 = 0x40;
 const RESET: u8 = 0x80;
@@ -40,15 +40,22 @@ pub(super) struct Map {
     keeps_oldest: fn(&Registers) -> bool,
 }
 
-type Registers = [[u8; 0x80]; 4];
+/// By bank.
+type Registers = [RegisterMap<u8>; 4];
 
 impl Map {
     /// The registers at power-up: the best clock, and an ICM-20948 sleeps.
     fn resets(&self) -> Registers {
-        let mut registers = [[0; 0x80]; 4];
-        registers[0][usize::from(self.who_am_i.0)] = self.who_am_i.1;
-        registers[0][usize::from(self.pwr_mgmt_1)] = if self.bank_sel.is_some() { SLEEP | 1 } else { 1 };
-        registers
+        let power = if self.bank_sel.is_some() { SLEEP | 1 } else { 1 };
+        let mut banks = [(); 4].map(|()| RegisterMap::holding(0x80, &[]));
+        banks[0].add(&[
+            Register(self.who_am_i.0, Access::Read, 0, self.who_am_i.1),
+            Register(self.pwr_mgmt_1, Access::ReadWrite, 0xff, power),
+            // The reset of the FIFO clears itself.
+            Register(self.user_ctrl, Access::ReadWrite, !self.fifo_reset, 0),
+            Register(self.overflow.0, Access::ClearOnRead, 0, 0),
+        ]);
+        banks
     }
 }
 
@@ -66,10 +73,10 @@ pub(super) const MPU9250: Map = Map {
     accel_config: (0, 0x1c, 3),
     // accel_fchoice_b of ACCEL_CONFIG_2 goes past the filter; else SMPLRT_DIV divides.
     rate_hz: |registers| {
-        if registers[0][0x1d] & 8 != 0 { 4000.0 } else { 1000.0 / (1.0 + f64::from(registers[0][0x19])) }
+        if registers[0].get(0x1d) & 8 != 0 { 4000.0 } else { 1000.0 / (1.0 + f64::from(registers[0].get(0x19))) }
     },
     // FIFO_MODE of CONFIG.
-    keeps_oldest: |registers| registers[0][0x1a] & 0x40 != 0,
+    keeps_oldest: |registers| registers[0].get(0x1a) & 0x40 != 0,
 };
 
 pub(super) const ICM20948: Map = Map {
@@ -86,11 +93,11 @@ pub(super) const ICM20948: Map = Map {
     accel_config: (2, 0x14, 1),
     // ACCEL_FCHOICE of ACCEL_CONFIG uses the filter, and ACCEL_SMPLRT_DIV divides.
     rate_hz: |registers| {
-        let divider = u16::from_be_bytes([registers[2][0x10], registers[2][0x11]]);
-        if registers[2][0x14] & 1 == 0 { 4500.0 } else { 1125.0 / (1.0 + f64::from(divider)) }
+        let divider = u16::from_be_bytes([registers[2].get(0x10), registers[2].get(0x11)]);
+        if registers[2].get(0x14) & 1 == 0 { 4500.0 } else { 1125.0 / (1.0 + f64::from(divider)) }
     },
     // FIFO_MODE.
-    keeps_oldest: |registers| registers[0][0x69] & 1 != 0,
+    keeps_oldest: |registers| registers[0].get(0x69) & 1 != 0,
 };
 
 pub(super) struct Mpu {
@@ -109,18 +116,18 @@ impl Mpu {
     }
 
     fn get(&self, register: u8) -> u8 {
-        self.registers[0][usize::from(register)]
+        self.registers[0].get(register)
     }
 
     fn catch_up(&mut self) {
         let room = Room { samples: FIFO / SAMPLE, replaces: !(self.map.keeps_oldest)(&self.registers) };
         let (bank, register, shift) = self.map.accel_config;
-        let range = self.registers[bank][usize::from(register)] >> shift & 3;
+        let range = self.registers[bank].get(register) >> shift & 3;
         let lsb_per_g = LSB_PER_G / f64::from(1u32 << range);
         self.head.catch_up(&mut self.fifo, room, |g| g.map(|g| value(g * lsb_per_g, 16)));
         if std::mem::take(&mut self.fifo.overrun) {
             let (register, bits) = self.map.overflow;
-            self.registers[0][usize::from(register)] |= bits;
+            self.registers[0].set(register, self.get(register) | bits);
         }
     }
 
@@ -135,14 +142,7 @@ impl Mpu {
     }
 }
 
-impl Chip for Mpu {
-    // klippy speaks I2C.
-    const SPI_MODES: &'static [u8] = &[];
-
-    fn register(&self, first: u8, _is_spi: bool) -> (u8, bool) {
-        (first & 0x7f, true)
-    }
-
+impl RegisterChip for Mpu {
     fn begin(&mut self) {
         self.catch_up();
     }
@@ -150,12 +150,11 @@ impl Chip for Mpu {
     fn read(&mut self, register: u8) -> u8 {
         let [high, low] = self.fifo.bytes().to_be_bytes();
         match register {
-            _ if self.bank != 0 => self.registers[self.bank][usize::from(register)],
+            _ if self.bank != 0 => self.registers[self.bank].read(register),
             _ if register == self.map.fifo_count => high,
             _ if register == self.map.fifo_count + 1 => low,
             _ if register == self.map.fifo_r_w => self.fifo.next_byte(i16::to_be_bytes),
-            _ if register == self.map.overflow.0 => std::mem::take(&mut self.registers[0][usize::from(register)]),
-            _ => self.get(register),
+            _ => self.registers[0].read(register),
         }
     }
 
@@ -164,13 +163,8 @@ impl Chip for Mpu {
             self.bank = usize::from(value >> 4 & 3);
             return;
         }
-        let is_user_ctrl = self.bank == 0 && register == self.map.user_ctrl;
-        if self.bank != 0 || ![self.map.who_am_i.0, self.map.overflow.0].contains(&register) {
-            // The reset of the FIFO clears itself.
-            let kept = if is_user_ctrl { value & !self.map.fifo_reset } else { value };
-            self.registers[self.bank][usize::from(register)] = kept;
-        }
-        if is_user_ctrl && value & self.map.fifo_reset != 0 {
+        self.registers[self.bank].write(register, value);
+        if self.bank == 0 && register == self.map.user_ctrl && value & self.map.fifo_reset != 0 {
             self.fifo.clear();
         }
         if self.bank == 0 && register == self.map.pwr_mgmt_1 && value & RESET != 0 {
@@ -259,7 +253,7 @@ mod tests {
             assert_ne!(bench.i2c_read(map.overflow.0), [0]);
             assert_eq!(bench.i2c_read(map.overflow.0), [0], "a read clears it");
             bench.i2c_write(map.pwr_mgmt_1, RESET);
-            assert_eq!(bench.i2c_read(map.pwr_mgmt_1), [map.resets()[0][usize::from(map.pwr_mgmt_1)]]);
+            assert_eq!(bench.i2c_read(map.pwr_mgmt_1), [map.resets()[0].get(map.pwr_mgmt_1)]);
             assert_eq!(count(&mut bench, map), 0, "a reset empties it");
             writes.iter().for_each(|(register, value)| bench.i2c_write(*register, *value));
             bench.i2c_write(map.pwr_mgmt_1, SLEEP);

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A1333 (Allegro, "SPI Interface").
 
-use super::shaft::{Frame, Shaft, even_parity};
-use crate::engine::spi::SpiChip;
+use super::shaft::{Shaft, even_parity};
+use crate::engine::spi::{ShiftRegister, SpiChip};
 
 /// A frame has a zero, a write bit, six bits of address and eight of data. The next frame returns the value that the
 /// register has when that frame begins.
 pub(super) struct A1333 {
     pub(super) shaft: Shaft,
-    frame: Frame,
+    frame: ShiftRegister<2>,
     /// The address of the last read.
     address: u8,
 }
@@ -19,7 +19,7 @@ impl A1333 {
     const ANG15: u8 = 0x32;
 
     pub(super) fn new(shaft: Shaft) -> A1333 {
-        A1333 { shaft, frame: Frame::default(), address: 0 }
+        A1333 { shaft, frame: ShiftRegister::load([0; 2]), address: 0 }
     }
 
     fn register(&self) -> u16 {
@@ -43,7 +43,7 @@ impl SpiChip for A1333 {
     }
 
     fn select(&mut self, _rate_hz: u32) {
-        self.frame.begin(self.register());
+        self.frame = ShiftRegister::load(self.register().to_be_bytes());
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
@@ -52,8 +52,8 @@ impl SpiChip for A1333 {
 
     fn deselect(&mut self) {
         // A write needs a code that no host has here.
-        if let Some(frame) = self.frame.whole().filter(|frame| frame & 0x4000 == 0) {
-            self.address = (frame >> 8 & 0x3f) as u8;
+        if let Some([first, _]) = self.frame.message().filter(|[first, _]| first & 0x40 == 0) {
+            self.address = first & 0x3f;
         }
     }
 }

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! AS5047D (ams, v1-10, "SPI Interface").
 
-use super::shaft::{Frame, Shaft, even_parity};
-use crate::engine::spi::SpiChip;
+use super::shaft::{Shaft, even_parity};
+use crate::engine::spi::{ShiftRegister, SpiChip};
 
 /// A frame has its even parity, a read bit, and 14 bits of address. An answer has its parity, an error bit, and 14 bits
 /// of data. The value is latched when the frame ends, and comes with the next frame.
 pub(super) struct As5047d {
     pub(super) shaft: Shaft,
-    frame: Frame,
+    frame: ShiftRegister<2>,
     answer: u16,
     /// The address for the next frame's data.
     writes: Option<u16>,
@@ -24,7 +24,7 @@ impl As5047d {
     const PARITY: u16 = 1 << 2;
 
     pub(super) fn new(shaft: Shaft) -> As5047d {
-        As5047d { shaft, frame: Frame::default(), answer: 0, writes: None, errors: 0, settings: [0x01, 0] }
+        As5047d { shaft, frame: ShiftRegister::load([0; 2]), answer: 0, writes: None, errors: 0, settings: [0x01, 0] }
     }
 
     /// The value at an address; `None` if there is no such register.
@@ -70,7 +70,7 @@ impl SpiChip for As5047d {
     }
 
     fn select(&mut self, _rate_hz: u32) {
-        self.frame.begin(self.answer);
+        self.frame = ShiftRegister::load(self.answer.to_be_bytes());
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
@@ -80,9 +80,9 @@ impl SpiChip for As5047d {
     fn deselect(&mut self) {
         // Reading the error flags clears them: the answer reports the earlier errors.
         let had_errors = self.errors != 0;
-        let data = match self.frame.whole() {
-            Some(frame) => self.take_in(frame),
-            None => {
+        let data = match self.frame.message() {
+            Some(frame) if self.frame.count == 2 => self.take_in(u16::from_be_bytes(frame)),
+            _ => {
                 self.errors |= As5047d::FRAMING;
                 0
             }

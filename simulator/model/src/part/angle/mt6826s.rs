@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! MT6826S (MagnTek, rev. 1.1, "SPI Interface").
 
-use super::shaft::{Shaft, crc8};
+use super::shaft::Shaft;
+use crate::engine::crc::crc8;
 use crate::engine::spi::SpiChip;
 
 /// Four bits of command and twelve of address, then data. A read returns as many registers as the host clocks out. The
@@ -41,7 +42,7 @@ impl Mt6826s {
         let angle = [high, low, 0];
         match address {
             Mt6826s::ANGLE..Mt6826s::CRC => angle[address - Mt6826s::ANGLE],
-            Mt6826s::CRC => crc8(0x07, 0, &angle),
+            Mt6826s::CRC => crc8(0x07, 0, angle),
             Mt6826s::AUTOCAL_STATUS => match self.calibrates_from {
                 None => 0,
                 Some(from) if (self.shaft.turns() - from).abs() < Mt6826s::AUTOCAL_TURNS => 1 << 6,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A motor's shaft with a magnet, and the common parts of several sensors' frames.
+//! A motor's shaft with a magnet, and the parity in several sensors' frames.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -34,37 +34,4 @@ impl Shaft {
 /// The bit that makes the number of ones even.
 pub(super) fn even_parity(word: u16) -> u16 {
     (word.count_ones() & 1) as u16
-}
-
-/// A cyclic redundancy check of 8 bits.
-pub(super) fn crc8(polynomial: u8, start: u8, bytes: &[u8]) -> u8 {
-    bytes.iter().fold(start, |crc, byte| {
-        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { (crc << 1) ^ polynomial } else { crc << 1 })
-    })
-}
-
-/// A frame of 16 bits both ways.
-#[derive(Default)]
-pub(super) struct Frame {
-    out: u16,
-    into: u16,
-    bytes: usize,
-}
-
-impl Frame {
-    pub(super) fn begin(&mut self, out: u16) {
-        *self = Frame { out, into: 0, bytes: 0 };
-    }
-
-    pub(super) fn exchange(&mut self, byte: u8) -> u8 {
-        let [high, low] = self.out.to_be_bytes();
-        self.out = u16::from(low) << 8;
-        self.into = self.into << 8 | u16::from(byte);
-        self.bytes += 1;
-        high
-    }
-
-    pub(super) fn whole(&self) -> Option<u16> {
-        (self.bytes == 2).then_some(self.into)
-    }
 }

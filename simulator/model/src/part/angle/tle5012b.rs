@@ -3,7 +3,8 @@
 
 use std::sync::Arc;
 
-use super::shaft::{Shaft, crc8};
+use super::shaft::Shaft;
+use crate::engine::crc::crc8;
 use crate::engine::spi::SpiChip;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 

@@ -29,7 +29,7 @@ pub(crate) const FULL_LOAD: u32 = 1000;
 
 /// Says in a driver's section that klippy can run without the section.
 pub(crate) fn may_be_left_out(cfg: &mut Sections) {
-    cfg.comment("The motor turns without this section, too. When you take it out, start Pinion anew: the chip");
+    cfg.comment("The motor turns without this section, too. When you take it out, restart Pinion: the chip");
     cfg.comment("keeps its settings, and then takes each pulse for two steps.");
 }
 

@@ -55,8 +55,8 @@ impl Edit {
     }
 }
 
-/// A side of the computer where files are changed: root's, or that of printer.cfg's owner.
-pub(super) struct Side<'a> {
+/// Reads and changes files of one owner, root or the owner of printer.cfg, with that user's rights.
+pub(super) struct Editor<'a> {
     pub(super) computer: &'a Computer,
     /// User and group whose files these are. `None`: the caller's.
     owner: Option<(u32, u32)>,
@@ -64,9 +64,9 @@ pub(super) struct Side<'a> {
     bytewise: RefCell<BTreeSet<PathBuf>>,
 }
 
-impl<'a> Side<'a> {
-    pub(super) fn new(computer: &'a Computer, owner: Option<(u32, u32)>) -> Side<'a> {
-        Side { computer, owner, bytewise: RefCell::default() }
+impl<'a> Editor<'a> {
+    pub(super) fn new(computer: &'a Computer, owner: Option<(u32, u32)>) -> Editor<'a> {
+        Editor { computer, owner, bytewise: RefCell::default() }
     }
 
     /// Whether only root may change these files.
@@ -109,7 +109,7 @@ impl<'a> Side<'a> {
         let folder = if makes { OwnFolder::make(&path)? } else { OwnFolder::open(&path)? };
         // Below --root no link is left on the way. One that comes meanwhile could lead out of it.
         if !self.computer.is_this() && fs::canonicalize(folder.at("."))? != path {
-            return Err(io::Error::other("a link has come on the way to it: call this again"));
+            return Err(io::Error::other("a link has appeared in its path: run this command again"));
         }
         Ok((folder, name.to_owned()))
     }
@@ -145,7 +145,7 @@ impl<'a> Side<'a> {
             Ok(about) if about.mode() & 0o200 == 0 => {
                 let path = file.display();
                 Err(format!(
-                    "{path} is read-only: chmod u+w {}, then call this again",
+                    "{path} is read-only: chmod u+w {}, then run this command again",
                     word(self.computer.path(file).display())
                 ))
             }
@@ -223,7 +223,7 @@ impl<'a> Side<'a> {
             let made = self.make_one(edit, &mut told);
             made.map_err(|why| match &done[..] {
                 [] => why,
-                done => format!("{why} ({} is changed already)", done.join(", ")),
+                done => format!("{why} ({} is already changed)", done.join(", ")),
             })?;
             done.push(edit.file.display().to_string());
         }
@@ -236,7 +236,7 @@ impl<'a> Side<'a> {
             move |error: io::Error| failed(&file, &error)
         };
         if self.read(file)? != *old {
-            return Err(format!("{} has changed meanwhile: call this again", file.display()));
+            return Err(format!("{} has changed since it was read: run this command again", file.display()));
         }
         let (Some(old), Some(new)) = (old, new) else {
             return match new {
@@ -264,7 +264,7 @@ impl<'a> Side<'a> {
             None => {
                 if saved.is_some() {
                     told.push(format!(
-                        "{} stays: it is {} as it was before pinion add",
+                        "{} stays: it is a copy of {} from before pinion add",
                         copy.display(),
                         file.display()
                     ));
@@ -293,7 +293,7 @@ impl<'a> Side<'a> {
             };
             let file = open().map_err(|error| failed(folder, &error))?;
             let lock = Flock::lock(file, FlockArg::LockExclusiveNonblock);
-            let busy = |_| format!("another pinion add changes files in {}: call this again", folder.display());
+            let busy = |_| format!("another pinion add changes files in {}: run this command again", folder.display());
             locks.push(lock.map_err(busy)?);
         }
         Ok(locks)
@@ -320,12 +320,12 @@ fn bytes_in(folder: &OwnFolder, name: &str) -> io::Result<Option<Vec<u8>>> {
 
 fn failed(file: &Path, error: &io::Error) -> String {
     let remedy = match error.kind() {
-        io::ErrorKind::PermissionDenied if !geteuid().is_root() => ": call it with sudo",
+        io::ErrorKind::PermissionDenied if !geteuid().is_root() => ": use sudo",
         io::ErrorKind::PermissionDenied => {
             ": its owner may not write there: see ls -ld and lsattr of the file and its folder"
         }
-        io::ErrorKind::ReadOnlyFilesystem => ": make the file system writable, then call it again",
-        io::ErrorKind::StorageFull => ": make room, then call it again",
+        io::ErrorKind::ReadOnlyFilesystem => ": make the file system writable, then run this command again",
+        io::ErrorKind::StorageFull => ": make room, then run this command again",
         _ => "",
     };
     format!("{}: {error}{remedy}", file.display())
