@@ -13,14 +13,15 @@ use nix::sys::mman::{MmapAdvise, madvise};
 /// kernel maps such a page again when it is used. Reading the command line and loading libraries touches thousands of
 /// pages that are never used again. Call it before memory is locked.
 pub fn give_back_unused() -> io::Result<()> {
-    // SAFETY: takes a number. The allocator gives back only what is free.
-    unsafe { libc::malloc_trim(0) };
     for range in unchanged_files(&fs::read_to_string("/proc/self/smaps")?) {
         let Some(start) = NonNull::new(ptr::with_exposed_provenance_mut::<c_void>(range.start)) else { continue };
         // SAFETY: the range is a mapping that cannot be written, and all its pages are those of its file. So a page that
         // is used again has the same content.
         unsafe { madvise(start, range.len(), MmapAdvise::MADV_DONTNEED) }?;
     }
+    // It comes last, because reading the mappings takes memory, too.
+    // SAFETY: takes a number. The allocator gives back only what is free.
+    unsafe { libc::malloc_trim(0) };
     Ok(())
 }
 
