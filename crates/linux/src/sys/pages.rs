@@ -5,15 +5,20 @@ use std::ffi::c_void;
 use std::fs;
 use std::io;
 use std::ops::Range;
+use std::path::Path;
 use std::ptr::{self, NonNull};
 
 use nix::sys::mman::{MmapAdvise, madvise};
 
-/// Gives back the free memory of the allocator, and the unchanged pages of the program's file and of its libraries. The
-/// kernel maps such a page again when it is used. Reading the command line and loading libraries touches thousands of
-/// pages that are never used again. Call it before memory is locked.
+/// Gives back the free memory of the allocator, and the unchanged pages of the program's libraries. The kernel maps such a
+/// page again when it is used. Loading libraries touches thousands of pages that are never used again. Call it before
+/// memory is locked.
+///
+/// The program's own file stays mapped: locked, its pages are there when the core needs them again, also if memory is
+/// short.
 pub fn give_back_unused() -> io::Result<()> {
-    for range in unchanged_files(&fs::read_to_string("/proc/self/smaps")?) {
+    let program = fs::read_link("/proc/self/exe")?;
+    for range in unchanged_files(&fs::read_to_string("/proc/self/smaps")?, &program) {
         let Some(start) = NonNull::new(ptr::with_exposed_provenance_mut::<c_void>(range.start)) else { continue };
         // SAFETY: the range is a mapping that cannot be written, and all its pages are those of its file. So a page that
         // is used again has the same content.
@@ -25,9 +30,9 @@ pub fn give_back_unused() -> io::Result<()> {
     Ok(())
 }
 
-/// The private mappings of files, from /proc/PID/smaps, that cannot be written and that have no page of their own. A page
-/// of its own differs from the file: the dynamic linker wrote addresses to it. It may be swapped out.
-fn unchanged_files(smaps: &str) -> Vec<Range<usize>> {
+/// The private mappings of files, from /proc/PID/smaps, that cannot be written and that have no page of their own, without
+/// those of `but`. A page of its own differs from the file: the dynamic linker wrote addresses to it. It may be swapped out.
+fn unchanged_files(smaps: &str, but: &Path) -> Vec<Range<usize>> {
     let mut found = Vec::new();
     let mut mapping = None;
     let mut own_kb = Vec::new();
@@ -40,8 +45,10 @@ fn unchanged_files(smaps: &str) -> Vec<Range<usize>> {
                 found.extend(mapping.take().filter(|_| own_kb == ["0", "0"]));
                 own_kb.clear();
             }
-            (Some(range), Some("r-xp" | "r--p")) if words.nth(3).is_some_and(|path| path.starts_with('/')) => {
-                mapping = parse_range(range);
+            (Some(range), Some("r-xp" | "r--p")) => {
+                // No other field has a slash, and a path may have spaces.
+                let path = line.find('/').map(|at| Path::new(&line[at..]));
+                mapping = path.filter(|path| *path != but).and_then(|_| parse_range(range));
             }
             _ => {}
         }
@@ -69,14 +76,19 @@ mod tests {
     #[test]
     fn only_unchanged_pages_of_files_are_given_back() {
         let text = mapping("1000-3000 r-xp 00001000 08:01 42                 /usr/lib/a b.so", 0, 0);
-        let found =
-            |smaps: &str| unchanged_files(smaps).iter().map(|range| (range.start, range.end)).collect::<Vec<_>>();
+        let found = |smaps: &str| {
+            unchanged_files(smaps, Path::new("/usr/bin/a program"))
+                .iter()
+                .map(|range| (range.start, range.end))
+                .collect::<Vec<_>>()
+        };
         assert_eq!(found(&text), [(0x1000, 0x3000)]);
         let kept = [
             mapping("1000-3000 r--p 00001000 08:01 42 /usr/lib/relocated.so", 4, 0),
             mapping("1000-3000 r--p 00001000 08:01 42 /usr/lib/swapped.so", 0, 4),
             mapping("1000-3000 rw-p 00001000 08:01 42 /usr/lib/data.so", 0, 0),
             mapping("1000-3000 r--s 00001000 08:01 42 /usr/share/shared", 0, 0),
+            mapping("1000-3000 r-xp 00001000 08:01 42    /usr/bin/a program", 0, 0),
             mapping("1000-3000 r--p 00000000 00:00 0", 0, 0),
             mapping("1000-3000 r-xp 00000000 00:00 0 [vdso]", 0, 0),
         ];
