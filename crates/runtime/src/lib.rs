@@ -175,6 +175,7 @@ pub fn run(
     let (realtime, margin) = (options.realtime, options.margin);
     // Later threads are in real time.
     started(pinion_linux::clock::watch_tick())?;
+    helpers::give_back_unused();
     if realtime {
         realtime::lock_memory();
     }

@@ -130,15 +130,20 @@ impl Program {
     }
 
     fn find_guardian(&self) -> Option<Pid> {
-        let pid = self.pid();
-        let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).ok()?;
-        let mut pids = children.split_whitespace().filter_map(|pid| pid.parse().ok()).map(Pid::from_raw);
-        pids.find(|pid| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name == "pinion-guardian\n"))
+        let name = |pid: &Pid| fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+        self.children().into_iter().find(|pid| name(pid) == "pinion-guardian\n")
     }
 
-    /// The program and the process that it forked, if any.
+    /// The processes that it forked.
+    fn children(&self) -> Vec<Pid> {
+        let pid = self.pid();
+        let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+        children.split_whitespace().filter_map(|pid| pid.parse().ok()).map(Pid::from_raw).collect()
+    }
+
+    /// The program and the processes that it forked.
     fn processes(&self) -> impl Iterator<Item = Pid> {
-        [self.pid()].into_iter().chain(self.find_guardian())
+        [self.pid()].into_iter().chain(self.children())
     }
 
     /// All of its threads.

@@ -20,9 +20,11 @@ use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
 use nix::unistd::{ForkResult, Pid};
 
 mod filter;
+mod pages;
 mod registers;
 
 pub use filter::allow_only_reading;
+pub use pages::give_back_unused;
 pub use registers::{Register, Registers};
 
 /// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).

@@ -61,6 +61,8 @@ pub(super) fn live(socket: &OwnedFd) {
         if !say(socket, &Answer::new(number, forms.as_ref(), looker.is_other, host, lines)) {
             return;
         }
+        // The next host may come in a month.
+        let _ = sys::give_back_unused();
     }
 }
 
