@@ -158,7 +158,10 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
     // The lines about each event are for a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
     logging::detach();
-    let symlink = std::env::temp_dir().join(format!("pinion_console_{}", std::process::id()));
+    // A console that was killed left its link, and this process may have got its number.
+    let name = |n: u32| std::env::temp_dir().join(format!("pinion_console_{}_{n}", std::process::id()));
+    let free = (0..u32::MAX).map(name).find(|path| path.symlink_metadata().is_err());
+    let symlink = free.ok_or("no name in the folder for temporary files is free")?;
     let recording = Recording::new(clock, &symlink, false, Vec::new()).map_err(|error| error.to_string())?;
     let options = Options {
         link: LinkName::Pty(symlink.clone()),

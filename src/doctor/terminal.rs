@@ -323,7 +323,7 @@ mod tests {
         assert!(remedy.starts_with("sudo mv -T /tmp/klipper_host_mcu /tmp/klipper_host_mcu.old && "), "{remedy}");
         let tree = Tree::empty();
         tree.put("tmp/klipper_host_mcu", "FORCE_SHUTDOWN\n");
-        let remedy = says(&looked(&tree), "terminal", Error, "exists and is no symbolic link");
+        let remedy = says(&looked(&tree), "terminal", Error, "exists but is not a symbolic link");
         assert!(remedy.starts_with("sudo rm /tmp/klipper_host_mcu"), "{remedy}");
     }
 

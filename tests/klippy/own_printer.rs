@@ -47,6 +47,11 @@ const PRINTERS: [&str; 4] = [
 #[test]
 fn printers_of_klippers_own_repository_home_and_print() {
     let Some(checkout) = checkout("printers_of_klippers_own_repository_home_and_print") else { return };
+    if is_kalico(&checkout) {
+        return here::not_run(
+            "Kalico refuses some of these printers: a display without [virtual_sdcard], a driver without sense_resistor",
+        );
+    }
     for name in PRINTERS {
         let (passed, steps) = tried(&checkout, &checkout.join("config").join(name), &["homed", "printed"]);
         assert!(passed, "{name}: {steps:?}");
@@ -78,6 +83,11 @@ fn a_printer_of_two_boards_is_leveled_and_prints() {
 #[test]
 fn printers_of_the_kind_that_users_have_pass_every_step() {
     let Some(checkout) = checkout("printers_of_the_kind_that_users_have_pass_every_step") else { return };
+    if is_kalico(&checkout) {
+        return here::not_run(
+            "Kalico refuses some of these printers: a display without [virtual_sdcard], a driver without sense_resistor",
+        );
+    }
     let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/support/testkit/printers");
     for (name, count) in [("voron-2.4", 11), ("ender-3", 10), ("mk3", 9), ("ratrig", 12), ("kossel", 9), ("idex", 8)] {
         let (passed, steps) = tried(&checkout, &printers.join(format!("{name}.cfg")), &[]);
@@ -231,6 +241,8 @@ fn a_change_that_does_not_fit_the_printer_fails() {
         let (_, steps) = tried_on(&checkout, &cfg, &printer, &["homed", step], home.path());
         let failed =
             steps.iter().find(|found| found["result"] == "failed").unwrap_or_else(|| panic!("{to}: {steps:?}"));
+        // Kalico leaves the endstop after homing.
+        let step = if is_kalico(&checkout) && to == "rotation_distance: 20" { "homed" } else { step };
         assert_eq!(failed["step"], step, "{to}: {failed}");
         // Kalico names the rail without "stepper_".
         let words = if is_kalico(&checkout) { words.replace("stepper_", "") } else { words.to_owned() };

@@ -114,7 +114,8 @@ fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
     let client = pinion.client();
     // The host is this process.
     let pid = std::process::id();
-    pinion.logged(&format!("the host, process {pid}, is no klippy: it is served as Klipper v0.13, master and Kalico"));
+    pinion
+        .logged(&format!("the host, process {pid}, is not a klippy: it is served as Klipper v0.13, master and Kalico"));
     // Today's hosts also accept the older form.
     assert!(client.dictionary().commands.contains_key(ONE_VALUE));
     until_once_more(&pinion, "host gone", || drop(client));

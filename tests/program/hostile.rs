@@ -51,7 +51,7 @@ fn a_terminal_that_a_client_closed_to_others_is_replaced_when_the_client_leaves(
     let client = client_of(&pinion);
     sys::make_exclusive(&client).unwrap();
     wrote_and_left(&pinion, client);
-    let replaced = pinion.logged("cannot be used any more");
+    let replaced = pinion.logged("can no longer be used");
     assert!(replaced.contains("resource busy") && replaced.contains("hosts find it there"), "{replaced}");
     assert!(is_open_to_others(&pinion));
     let mut host = pinion.client();
@@ -73,7 +73,7 @@ fn a_link_that_another_program_took_stays_when_the_terminal_is_replaced() {
     fs::remove_file(pinion.link()).unwrap();
     std::os::unix::fs::symlink("/dev/null", pinion.link()).unwrap();
     wrote_and_left(&pinion, client);
-    pinion.logged("cannot be used any more");
+    pinion.logged("can no longer be used");
     assert_eq!(fs::read_link(pinion.link()).unwrap().to_str(), Some("/dev/null"));
 }
 
@@ -85,7 +85,7 @@ fn a_terminal_that_a_silent_client_closed_to_others_is_opened_again() {
     drop(client);
     pinion.until("the terminal is open to others", || is_open_to_others(&pinion));
     pinion.client().status().unwrap();
-    assert!(!pinion.log().contains("cannot be used any more"), "{}", pinion.log());
+    assert!(!pinion.log().contains("can no longer be used"), "{}", pinion.log());
 }
 
 #[test]
@@ -131,7 +131,7 @@ fn a_program_that_can_open_no_further_file_serves_on_and_the_next_host_when_it_c
     limit_files(&pinion, None);
     host.status().unwrap();
     drop(host);
-    let refused = pinion.logged("cannot be used any more");
+    let refused = pinion.logged("can no longer be used");
     assert!(refused.contains("Too many open files") && refused.contains("raise LimitNOFILE"), "{refused}");
     // While the program can open no file, nobody gets an answer on these sockets.
     let _status = std::os::unix::net::UnixStream::connect(pinion.link().with_extension("sock"));

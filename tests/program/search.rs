@@ -58,7 +58,7 @@ fn the_search_ends_with_the_program_and_not_before() {
         kill(Pid::from_raw(search as i32), signal).unwrap();
     }
     drop(pinion.client());
-    pinion.logged(&format!("the host, process {}, is no klippy", std::process::id()));
+    pinion.logged(&format!("the host, process {}, is not a klippy", std::process::id()));
     pinion.signal(Signal::SIGKILL);
     pinion.end();
     pinion.until("the search's end", || is_gone(search));

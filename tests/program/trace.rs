@@ -122,7 +122,7 @@ fn the_newest_recording_is_found_and_all_are_listed() {
     assert_eq!(lines.len(), 3, "{listed}");
     assert!(lines[0].starts_with("2026-11-22 14:27:14 UTC") && lines[0].contains("not known why"), "{listed}");
     assert!(lines[1].starts_with("2026-11-22 14:26:14 UTC") && lines[1].ends_with(VERDICT), "{listed}");
-    assert!(lines[2].starts_with("cannot be read") && lines[2].ends_with("it is no trace of Pinion"), "{listed}");
+    assert!(lines[2].starts_with("cannot be read") && lines[2].ends_with("it is not a trace of Pinion"), "{listed}");
 
     let empty = tempfile::tempdir().unwrap();
     for args in [&[][..], &["--list"], &["-I", "/tmp/klipper_host_other"]] {
@@ -136,7 +136,7 @@ fn a_file_that_is_no_recording_is_refused() {
     let (folder, path) = kept("x", &late_host());
     fs::write(&path, "x").unwrap();
     let said = complaint(&trace(folder.path(), &[path.to_str().unwrap()]));
-    assert!(said.contains(&format!("{}: it is no trace of Pinion", path.display())), "{said}");
+    assert!(said.contains(&format!("{}: it is not a trace of Pinion", path.display())), "{said}");
     let said = complaint(&trace(folder.path(), &["/nonexistent/x"]));
     assert!(said.contains("/nonexistent/x: No such file"), "{said}");
     let said = complaint(&trace(folder.path(), &["/dev/null"]));

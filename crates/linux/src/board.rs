@@ -149,7 +149,7 @@ impl LinuxBoard {
                 })
             }
             other => {
-                let stop = Shutdown::because(reason::ADC_OPEN, format!("{other} is no ADC channel"));
+                let stop = Shutdown::because(reason::ADC_OPEN, format!("{other} is not an ADC channel"));
                 Err(stop.remedy("choose an analog pin (pinion pins lists them)"))
             }
         }
@@ -349,7 +349,7 @@ mod tests {
         assert_eq!(error.reason, reason::NOT_INPUT);
         let error = board.adc(Pin(17)).err().unwrap();
         assert_eq!(error.reason, reason::ADC_OPEN);
-        assert!(error.to_string().contains("gpiochip0 line 17 is no ADC channel"), "{error}");
+        assert!(error.to_string().contains("gpiochip0 line 17 is not an ADC channel"), "{error}");
     }
 
     #[test]

@@ -162,9 +162,8 @@ pub fn open_line(path: &Path, baud: Option<u32>) -> Result<Flock<File>, Trouble>
                 .remedy("name another rate, in printer.cfg too")
         })?;
         if (f64::from(real) / f64::from(baud) - 1.0).abs() > RATE_ERROR_MAX {
-            return Err(
-                Trouble::new(format!("it makes {real} of {baud} baud")).remedy("name another rate, in printer.cfg too")
-            );
+            return Err(Trouble::new(format!("the port rounds {baud} baud to {real}"))
+                .remedy("name another rate, in printer.cfg too"));
         }
         Ok(file)
     };
@@ -301,7 +300,8 @@ fn in_use() -> Trouble {
 
 fn no_port(error: impl Into<io::Error>) -> Trouble {
     let error = error.into();
-    Trouble::new(format!("it is no serial port that works: {error}")).remedy("choose another (pinion pins lists them)")
+    Trouble::new(format!("it is not a serial port that works: {error}"))
+        .remedy("choose another (pinion pins lists them)")
 }
 
 fn cannot_open(path: &Path, error: &io::Error) -> Trouble {
@@ -357,7 +357,7 @@ mod tests {
         }
         for other in ["/dev/null", "/dev/zero"] {
             let said = find_line(Path::new(other)).unwrap_err().to_string();
-            assert!(said.starts_with(&format!("{other}: it is no serial port that works")), "{said}");
+            assert!(said.starts_with(&format!("{other}: it is not a serial port that works")), "{said}");
         }
     }
 
@@ -445,7 +445,7 @@ mod tests {
         let dev = tempfile::tempdir().unwrap();
         fs::write(dev.path().join("ttyS0"), "").unwrap();
         for (name, is_console, said) in [
-            ("ttyS0", false, "ttyS0: it is no serial port that works"),
+            ("ttyS0", false, "ttyS0: it is not a serial port that works"),
             ("ttyS1", false, "ttyS1: it is gone: plug"),
             ("ttyS0", true, "the kernel writes its messages to it: remove its console="),
         ] {

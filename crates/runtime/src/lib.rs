@@ -260,7 +260,7 @@ fn end(
         End::Asked | End::HostOver => Ok(()),
         End::GuardianLost => {
             Err(Trouble::new("the guardian is gone, so Pinion ends")
-                .remedy("start it anew, as the service does by itself"))
+                .remedy("restart it (the service does so by itself)"))
         }
     }
 }

@@ -199,7 +199,7 @@ impl Trace {
 }
 
 fn no_trace() -> io::Error {
-    io::Error::other("it is no trace of Pinion")
+    io::Error::other("it is not a trace of Pinion")
 }
 
 /// A line without its end.
@@ -265,7 +265,7 @@ pub(crate) mod tests {
     #[test]
     fn what_is_no_trace_is_refused_in_words() {
         for bytes in [&b""[..], b"pinion trace 1\n{}\n", &[0x1f, 0x8b, 8, 0]] {
-            assert_eq!(Trace::read(bytes).unwrap_err().to_string(), "it is no trace of Pinion");
+            assert_eq!(Trace::read(bytes).unwrap_err().to_string(), "it is not a trace of Pinion");
         }
     }
 

@@ -217,7 +217,7 @@ impl<'a> History<'a> {
             Event::HostCame => "a host opened the terminal".to_owned(),
             Event::HostGone => "the host closed the terminal".to_owned(),
             Event::Refused(Refusal::Garbage) => "garbage came from the host".to_owned(),
-            Event::Refused(Refusal::Lost) => "a block came behind one that was lost in garbage".to_owned(),
+            Event::Refused(Refusal::Lost) => "a block came after one that was lost in garbage".to_owned(),
             Event::Refused(Refusal::Repeated) => {
                 "the host sent a block again, without an acknowledgement of it in time".to_owned()
             }

@@ -26,7 +26,7 @@ pub(crate) fn text(path: &Path) -> Result<String, Trouble> {
         trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
     };
     let bytes = files::read(path, DESCRIPTION_MIB).map_err(|error| unreadable(error.to_string()))?;
-    String::from_utf8(bytes).map_err(|_| unreadable("this is no UTF-8 text".into()))
+    String::from_utf8(bytes).map_err(|_| unreadable("this is not UTF-8 text".into()))
 }
 
 /// Makes the board of a description, for the commands of `pinion` ([`pinion::simulator::Open`]).

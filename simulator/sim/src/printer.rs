@@ -331,7 +331,7 @@ fn asked_to_end() -> Result<Arc<AtomicBool>, String> {
     let asked = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
         signal_hook::flag::register(signal, asked.clone())
-            .map_err(|error| format!("signals cannot be taken in: {error}"))?;
+            .map_err(|error| format!("signals cannot be received: {error}"))?;
     }
     Ok(asked)
 }

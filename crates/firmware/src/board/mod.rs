@@ -355,7 +355,7 @@ impl BusError {
     }
 
     fn other_kind(wanted: &str, is: &str) -> BusError {
-        let cause = format!("{wanted} was asked of {is}: a fault of the host's configuration");
+        let cause = format!("the host asked for {wanted} on {is}: a fault of the host's configuration");
         BusError::new(BusStatus::Nack, Trouble::new(cause).remedy("correct the bus"))
     }
 }

@@ -231,7 +231,7 @@ const CONFIG_BUTTONS: Command =
     command!("config_buttons oid=%c button_count=%c", |context, oid: Oid, button_count: u8| {
         let count = usize::from(button_count);
         if count > BUTTONS {
-            return Err(Shutdown::by_host(MAX_BUTTONS, format_args!("{count} buttons are asked for")));
+            return Err(Shutdown::by_host(MAX_BUTTONS, format_args!("the host asks for {count} buttons")));
         }
         context.assign(oid, Buttons::new(count))
     });

@@ -127,7 +127,7 @@ impl Object for Ds18b20 {
         } else if at.since(self.asked) > READ_LIMIT {
             context.try_shut_down(Shutdown::because(
                 TOO_SLOW,
-                Trouble::new("its reading is under way for more than 5 s")
+                Trouble::new("its reading has taken more than 5 s")
                     .remedy("look at the kernel's log (dmesg), or connect fewer sensors to one wire"),
             ))?;
         }

@@ -226,7 +226,7 @@ fn configure(
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
         }
         let Some(Mosi { line: OnWorker { bus, device }, .. }) = context.board()?.mosi(mosi, spi::RATE_HZ)? else {
-            let cause = format!("{sclk} is no data output of an SPI device");
+            let cause = format!("{sclk} is not the data output of an SPI device");
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
         };
         let way = context.device(&bus, Box::new(Interface::Spi(Waves::new(device, pulses, sclk))))?;

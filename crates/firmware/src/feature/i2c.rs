@@ -315,7 +315,7 @@ impl I2c {
         };
         // Commands wait for each other, so the job is here.
         let Some(present) = self.transfer.here() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came during another one"));
         };
         *present = transfer;
         self.transfer.send(context, bus.chip())

@@ -168,7 +168,7 @@ const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
             return refuse(TRIGGER_TOO_LARGE, format!("{trigger_grams} g are above {TRIGGER_GRAMS_MAX}"));
         }
         if !(0..1 << GRAMS_PER_COUNT_FRAC_BITS).contains(&grams_per_count) {
-            return refuse(GRAMS_PER_COUNT, format!("{grams_per_count} is no fraction of 2^29"));
+            return refuse(GRAMS_PER_COUNT, format!("{grams_per_count} is not a fraction of 2^29"));
         }
         probe.limits = Limits {
             counts_min: safety_counts_min,

@@ -105,7 +105,7 @@ impl Neopixel {
     fn send(&mut self, context: &mut Context) -> Result<(), Shutdown> {
         // Commands wait for each other, so the frame is here.
         let Some(frame) = self.frame.here() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came during another one"));
         };
         frame.data.copy_from_slice(&self.data);
         self.frame.send(context, self.way)

@@ -166,7 +166,7 @@ impl Spi {
             return Err(invalid(format_args!("mode {mode} is outside 0 to 3")));
         }
         if self.bus.is_some() {
-            return Err(invalid("it has a bus already"));
+            return Err(invalid("it already has a bus"));
         }
         // Klipper's C opens a bus even then. Here the core would have to wait for the files, and steps with it.
         if context.is_finalized() {

@@ -389,7 +389,7 @@ impl SpiAngle {
     fn ask(&mut self, context: &mut Context, data: &[u8]) -> Result<(), Shutdown> {
         // Commands wait for each other, so the job is here. One from before a stop may still be under way.
         let Some(transfer) = self.transfer.here() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came during another one"));
         };
         transfer.load(data);
         // A timer may have begun the request under way. The transfer behind it then does not hold commands by itself.

@@ -223,7 +223,7 @@ const CONFIG_TMCUART: Command = command!(
         let (way, wire, pace) = match context.board()?.serial(rx_pin, rate_hz(bit_time))? {
             Some(_) if rx_pin != tx_pin => {
                 let (rx, tx) = (context.name(rx_pin), context.name(tx_pin));
-                let cause = format!("it cannot receive on {rx} and send on {tx}, as a serial port does both");
+                let cause = format!("it cannot receive on {rx} and send on {tx}, because a serial port does both");
                 return Err(Shutdown::because(reason::SERIAL_OPEN, cause).remedy("remove tx_pin"));
             }
             Some(OnWorker { bus, device }) => {

@@ -17,7 +17,7 @@ use super::forms::{Entry, Item, Part, entries};
 use super::{DialectName, Forms, Wire, base};
 
 /// The remedy for a host with another dictionary.
-pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
+pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary again";
 
 /// A command of the dialect, found by its id.
 pub(super) struct Known {

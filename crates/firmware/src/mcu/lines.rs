@@ -121,7 +121,7 @@ impl Context<'_> {
     pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
         let own = self.board()?.canonical(pin);
         if self.state.lines.find(own).is_some() {
-            return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
+            return Ok((self.input(pin, bias)?, Err("the pin already has another use".into())));
         }
         let CountedLine { line, edges } = self.state.board.counted_line(own, bias)?;
         let (_, claim) = self.state.enter(own, line, Direction::Input(bias), None)?;

@@ -274,7 +274,7 @@ impl Mcu {
             && !self.state.phase.is_stopped()
         {
             let cause = format!(
-                "events are {} ms late: more steps are asked for than this computer can do, or something kept it from running",
+                "events are {} ms late: the host asks for more steps than this computer can make, or something kept Pinion from running",
                 late as u64 / u64::from(Ticks::from_ms(1).0)
             );
             let stop = Shutdown::because(reason::TIMER_PAST, cause).late_for(next);

@@ -143,7 +143,7 @@ impl Timers {
     /// place. So there is at most one entry more than timers.
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
         self.change(|timers| {
-            debug_assert!(!timers.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
+            debug_assert!(!timers.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} already waits");
             timers.waiting.push((at, timer));
             timers.settle(at, timer);
         });

@@ -133,10 +133,10 @@ fn a_chip_knows_one_kind_of_bus() {
     I2cChip.read_register(&[7], &mut bytes).unwrap();
     assert_eq!(bytes, [7; 2]);
     for (failure, words) in [
-        (SpiChip.write_read(&[1], &mut bytes), "an I2C transfer was asked of an SPI device"),
-        (SpiChip.read_register(&[1], &mut bytes), "an I2C transfer was asked of an SPI device"),
-        (I2cChip.exchange(&mut [1]), "an SPI transfer was asked of an I2C device"),
-        (I2cChip.send(&[1]), "an SPI transfer was asked of an I2C device"),
+        (SpiChip.write_read(&[1], &mut bytes), "the host asked for an I2C transfer on an SPI device"),
+        (SpiChip.read_register(&[1], &mut bytes), "the host asked for an I2C transfer on an SPI device"),
+        (I2cChip.exchange(&mut [1]), "the host asked for an SPI transfer on an I2C device"),
+        (I2cChip.send(&[1]), "the host asked for an SPI transfer on an I2C device"),
     ] {
         let failure = failure.unwrap_err();
         assert_eq!(failure.status, BusStatus::Nack);

@@ -96,7 +96,7 @@ impl Subject {
                 Trouble::new(format!("{self} cannot be {action}: {}: the chip {label} does not offer it", text(code)))
                     .remedy("choose another pin")
             }
-            _ => Trouble::new(format!("{self} cannot be had as {action}: {}", text(code)))
+            _ => Trouble::new(format!("{self} cannot be used as {action}: {}", text(code)))
                 .remedy("look at the kernel's log (dmesg), or choose another pin"),
         }
     }
@@ -175,7 +175,7 @@ fn forbidden(path: &Path, opener: &Opener) -> Trouble {
     match (&opener.group, opener.command()) {
         (Some(group), Some(command)) => {
             Trouble::new(format!("{who} may not open {path}, which belongs to group {group}"))
-                .remedy(format!("\"{command}\", log in anew and start Pinion again"))
+                .remedy(format!("\"{command}\", log in again, then restart Pinion"))
         }
         _ => Trouble::new(format!("{who} may not open {path}, which is root's alone")).remedy(
             "\"sudo udevadm trigger\" or a reboot puts Pinion's udev rules in force, where they are installed; or run \
@@ -277,7 +277,7 @@ mod tests {
         assert_eq!(
             text(Some("gpio")),
             "pi may not open /dev/gpiochip0, which belongs to group gpio: \"sudo usermod -aG gpio pi\", log in \
-             anew and start Pinion again"
+             again, then restart Pinion"
         );
         assert!(text(None).contains("udev"));
     }

@@ -41,7 +41,7 @@ impl Place {
                     .remedy("choose another path with -I, such as one in that folder"),
             ),
             Place::File => Some(
-                Trouble::new(format!("{link} exists and is no symbolic link"))
+                Trouble::new(format!("{link} exists but is not a symbolic link"))
                     .remedy("remove it, or choose another path with -I"),
             ),
         }

@@ -130,11 +130,11 @@ impl Pty {
         let left = self.device.display().to_string();
         match self.replace() {
             Ok(()) => warn!(
-                "{left} cannot be used any more: {error}: {} leads to {} now, and hosts find it there",
+                "{left} can no longer be used: {error}: {} leads to {} now, and hosts find it there",
                 self.symlink.display(),
                 self.device.display()
             ),
-            Err(trouble) => warn!("{left} cannot be used any more: {error}: {trouble} (tried again until it works)"),
+            Err(trouble) => warn!("{left} can no longer be used: {error}: {trouble} (tried again until it works)"),
         }
     }
 
@@ -421,7 +421,7 @@ mod tests {
         ] {
             let path = file(folder, content);
             let error = Pty::open(&path, &access).err().unwrap().to_string();
-            assert!(error.contains("exists and is no symbolic link: remove it"), "{error}");
+            assert!(error.contains("exists but is not a symbolic link: remove it"), "{error}");
             assert_eq!(fs::read_to_string(&path).unwrap(), content);
         }
         for folder in [Path::new("/"), elsewhere.path()] {

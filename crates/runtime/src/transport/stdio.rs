@@ -142,7 +142,7 @@ impl Stdio {
 /// They are a person's terminal.
 pub fn can_use() -> Result<(), Trouble> {
     if shows_log(io::stdin()) || shows_log(io::stdout()) {
-        return Err(Trouble::new("this terminal shows the log, and a host's bytes are no text")
+        return Err(Trouble::new("this terminal shows the log, and a host's bytes are not text")
             .of("--link stdio")
             .remedy("let socat or ssh start Pinion so, or leave out --link for a host on this computer"));
     }

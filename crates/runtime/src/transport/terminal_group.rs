@@ -49,7 +49,7 @@ impl TerminalGroup {
         let remedy = match gid.as_raw() {
             // Members of this group could do more than open a terminal.
             0 => "choose another group with -g, such as tty".to_owned(),
-            _ => format!("sudo usermod -aG {name} {user}, and log in anew, or choose another group with -g"),
+            _ => format!("sudo usermod -aG {name} {user}, and log in again, or choose another group with -g"),
         };
         Trouble::new(format!("the terminal cannot be given to the group {name}: {why}")).remedy(remedy)
     }

@@ -76,7 +76,7 @@ impl Place {
             return own.mcus.iter().map(|mcu| in_place(own, mcu)).collect::<Result<_, _>>().map(Place::InPlace);
         }
         if let Some(klipper) = args.klipper().filter(|klipper| args.without_plugins && !is_checkout(klipper)) {
-            let trouble = Trouble::new("there is no klippy/klippy.py in it").of(klipper.display());
+            let trouble = Trouble::new("it has no klippy/klippy.py").of(klipper.display());
             return Err(trouble.remedy("name a checkout of Klipper or Kalico with --klipper"));
         }
         if !own.left_out.sections.is_empty() {

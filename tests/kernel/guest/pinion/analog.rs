@@ -118,7 +118,7 @@ fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
     let program = Program::start();
     let client = &mut program.connect();
     assert_eq!(refusal(client, 1, &[input(0, "gpio3")]), "Unable to open adc device");
-    program.wait_for_line(&["gpiochip0 line 3 is no ADC channel"]);
+    program.wait_for_line(&["gpiochip0 line 3 is not an ADC channel"]);
     assert_eq!(refusal(client, 1, &[input(0, "33619967")]), "Unable to open adc device");
     program.wait_for_line(&["there is no channel 255 on iio:device255", "mock-adc12: voltage0 voltage1"]);
 }

@@ -68,7 +68,7 @@ systemctl stop pinion-mcu
 mark
 setpriv --reuid=stranger --regid=stranger --init-groups mkfifo -m 666 $LINK
 not systemctl start pinion-mcu
-said | grep "$LINK exists and is no symbolic link: remove it" >/dev/null
+said | grep "$LINK exists but is not a symbolic link: remove it" >/dev/null
 rm $LINK
 until_true 20 is_active pinion-mcu
 # ... and by a link to a terminal that another program serves. Its text has a line for the log in it.

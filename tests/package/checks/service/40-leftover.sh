@@ -11,7 +11,7 @@ done
 mark
 echo 'a letter' >$LINK
 not systemctl start pinion-mcu
-said | grep "$LINK exists and is no symbolic link: remove it" >/dev/null
+said | grep "$LINK exists but is not a symbolic link: remove it" >/dev/null
 tried_again() { [ "$(systemctl show -P NRestarts pinion-mcu)" -gt 0 ]; }
 until_true 20 tried_again
 is "$(cat $LINK)" 'a letter'

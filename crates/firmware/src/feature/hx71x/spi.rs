@@ -66,7 +66,7 @@ impl Waves {
         if poll[0] & 1 != 0 {
             self.looks = self.looks.saturating_add(1);
             if self.looks > LOOKS_MAX && !std::mem::replace(&mut self.has_warned, true) {
-                let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, as an output that is high between transfers switches the chip off; said once");
+                let trouble = Trouble::new("the chip has no sample").remedy("check its supply, its clock at MOSI and its data at MISO, or use another SPI bus, because an output that is high between transfers switches the chip off; said once");
                 let trouble = trouble.of(format_args!("{} ({})", SUBJECT, self.name));
                 self.warning = Some(DeviceWarning::new(SUBJECT, trouble));
             }

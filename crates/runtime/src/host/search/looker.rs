@@ -160,7 +160,7 @@ impl Looker {
                 return unknown;
             }
             Ok(Search::Nobody) => {
-                say.info(format!("the host is no klippy that could be found: {}", union("")));
+                say.info(format!("the host is not a klippy that Pinion can find: {}", union("")));
                 return unknown;
             }
             Err(error) => {
@@ -216,7 +216,7 @@ fn forms_of(process: &Process, host: &mut FoundHost, began: Instant, say: &mut S
                 "the host is on another computer (process {pid} is pinion attach), its sources cannot be read: {}",
                 union(remedy)
             ),
-            false => format!("the host, process {pid}, is no klippy: {}", union("")),
+            false => format!("the host, process {pid}, is not a klippy: {}", union("")),
         });
         return None;
     };

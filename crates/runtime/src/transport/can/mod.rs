@@ -98,7 +98,7 @@ pub fn can_open(interface: &str) -> Result<(), Trouble> {
     let opened = socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, SockProtocol::CanRaw);
     opened.map_err(|error| refusal(interface, error.into()))?;
     if can::is_other(interface) {
-        return Err(Trouble::new("it is no CAN interface").of(interface).remedy(NAME_ONE));
+        return Err(Trouble::new("it is not a CAN interface").of(interface).remedy(NAME_ONE));
     }
     Ok(())
 }
