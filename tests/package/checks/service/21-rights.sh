@@ -18,7 +18,7 @@ not inside 'test -L /tmp/klipper_host_mcu'
 # The search examines a host of klippy's user.
 mark
 identifies
-looked() { said | grep 'is no klippy'; }
+looked() { said | grep 'is not a klippy'; }
 until_true 10 looked
 # A killed search is reported, and the service continues.
 before=$(pid)
