@@ -3,7 +3,7 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use pinion_testkit::here;
@@ -46,12 +46,7 @@ const PRINTERS: [&str; 4] = [
 
 #[test]
 fn printers_of_klippers_own_repository_home_and_print() {
-    let Some(checkout) = checkout("printers_of_klippers_own_repository_home_and_print") else { return };
-    if is_kalico(&checkout) {
-        return here::not_run(
-            "Kalico refuses some of these printers: a display without [virtual_sdcard], a driver without sense_resistor",
-        );
-    }
+    let Some(checkout) = klippers("printers_of_klippers_own_repository_home_and_print") else { return };
     for name in PRINTERS {
         let (passed, steps) = tried(&checkout, &checkout.join("config").join(name), &["homed", "printed"]);
         assert!(passed, "{name}: {steps:?}");
@@ -82,12 +77,7 @@ fn a_printer_of_two_boards_is_leveled_and_prints() {
 
 #[test]
 fn printers_of_the_kind_that_users_have_pass_every_step() {
-    let Some(checkout) = checkout("printers_of_the_kind_that_users_have_pass_every_step") else { return };
-    if is_kalico(&checkout) {
-        return here::not_run(
-            "Kalico refuses some of these printers: a display without [virtual_sdcard], a driver without sense_resistor",
-        );
-    }
+    let Some(checkout) = klippers("printers_of_the_kind_that_users_have_pass_every_step") else { return };
     let printers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/support/testkit/printers");
     for (name, count) in [("voron-2.4", 11), ("ender-3", 10), ("mk3", 9), ("ratrig", 12), ("kossel", 9), ("idex", 8)] {
         let (passed, steps) = tried(&checkout, &printers.join(format!("{name}.cfg")), &[]);
@@ -124,6 +114,18 @@ fn every_configuration_of_a_printer_in_the_checkout_is_served() {
         count += usize::from(done.status.success());
     }
     assert!(count > 120, "{count}");
+}
+
+/// A checkout of Klipper, not of Kalico.
+fn klippers(test: &str) -> Option<PathBuf> {
+    let checkout = checkout(test)?;
+    if is_kalico(&checkout) {
+        here::not_run(
+            "Kalico refuses some of these printers: a display without [virtual_sdcard], a driver without sense_resistor",
+        );
+        return None;
+    }
+    Some(checkout)
 }
 
 /// Kalico refuses the same, partly in other words.

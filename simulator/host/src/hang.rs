@@ -9,16 +9,18 @@ use std::fs;
 use std::path::Path;
 use std::process::Child;
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
+
+use crate::klippy::await_end;
 
 /// The environment's word that makes Python print them.
 pub(crate) const PRINTS: &str = "PYTHONFAULTHANDLER=1";
 /// How long, in real time, Python may take to print them.
 const PRINT: Duration = Duration::from_secs(5);
-/// Real time between two looks at the process.
+/// Real time between two looks at what the process does.
 const LOOK: Duration = Duration::from_millis(10);
 /// Looks at what a process does. One that computes takes a lock for an instant now and then.
 const LOOKS: usize = 10;
@@ -56,10 +58,7 @@ impl Hang {
         let before = fs::metadata(output).map_or(0, |about| about.len() as usize);
         // It leads a group of its own, so a script that started Python gets it, too.
         let _ = signal::killpg(Pid::from_raw(klippy.id().cast_signed()), Signal::SIGABRT);
-        let until = Instant::now() + PRINT;
-        while Instant::now() < until && matches!(klippy.try_wait(), Ok(None)) {
-            thread::sleep(LOOK);
-        }
+        await_end(klippy, PRINT);
         let said = fs::read(output).unwrap_or_default();
         let places = places(&String::from_utf8_lossy(said.get(before..).unwrap_or_default()));
         Hang { computes, places }
@@ -112,6 +111,7 @@ mod tests {
         python.arg(PRINTS).arg("python3").arg(path("plugin.py")).process_group(0).stdin(Stdio::null());
         let mut child = python.stdout(output.try_clone().unwrap()).stderr(output).spawn().unwrap();
         while fs::read_to_string(path("out")).unwrap() != "begins\n" {
+            assert!(child.try_wait().unwrap().is_none(), "it ended before");
             thread::sleep(LOOK);
         }
         let hang = Hang::examine(&mut child, &path("out"));

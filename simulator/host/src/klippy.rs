@@ -45,6 +45,8 @@ const LOOK: Duration = Duration::from_secs(5);
 const FIRST_MOMENTS: Duration = Duration::from_secs(3);
 /// How long klippy has to end in order, in real time.
 const END_TIME: Duration = Duration::from_secs(3);
+/// Time between two looks at a process that shall end.
+const LOOK_FOR_END: Duration = Duration::from_millis(20);
 /// Time between two looks at an API that is not there yet.
 const LOOK_FOR_API: Duration = Duration::from_millis(50);
 /// Time between two calls of a watch. The printer keeps half a second of an axis at 32,000 steps per second.
@@ -529,6 +531,14 @@ fn await_api(
     }
 }
 
+/// Waits for the end of a process, for at most this real time.
+pub(crate) fn await_end(process: &mut Child, span: Duration) {
+    let until = Instant::now() + span;
+    while Instant::now() < until && matches!(process.try_wait(), Ok(None)) {
+        thread::sleep(LOOK_FOR_END);
+    }
+}
+
 /// The texts of a list.
 fn texts(list: &Value) -> Vec<String> {
     list.as_array().into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
@@ -582,13 +592,7 @@ impl<W> Host<W> {
             return;
         }
         let _ = signal::kill(Pid::from_raw(pid), Signal::SIGTERM);
-        let until = Instant::now() + END_TIME;
-        while Instant::now() < until {
-            if matches!(self.child.try_wait(), Ok(Some(_)) | Err(_)) {
-                break;
-            }
-            thread::sleep(Duration::from_millis(20));
-        }
+        await_end(&mut self.child, END_TIME);
         let _ = group();
         let _ = self.child.wait();
     }

@@ -114,14 +114,18 @@ mod tests {
         assert!(!probe.sense(false, now));
     }
 
-    #[test]
-    fn the_head_takes_it_up_in_its_dock_and_leaves_it_there() {
+    /// The x axis, a dock, and a probe in it. The nozzle is at 60, 45 and 12 mm.
+    fn docked(dock_mm: [f64; 2], tip: [f64; 3]) -> (Arc<Axis>, Arc<Dock>, impl Wire) {
         let printer = DefaultPrinter::read();
         let [x, y, z] = [0, 1, 2].map(|place| Arc::new(Axis::new(&printer.axes[place])));
         let bed = Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z));
-        // The nozzle is at 60, 45 and 12 mm.
-        let dock = Arc::new(Dock::new(x.rail().clone(), y.rail().clone(), [70.0, 45.0]));
-        let probe = switch(bed, [0.0; 3], Some(dock.clone()));
+        let dock = Arc::new(Dock::new(x.rail().clone(), y.rail().clone(), dock_mm));
+        (x, dock.clone(), switch(bed, tip, Some(dock)))
+    }
+
+    #[test]
+    fn the_head_takes_it_up_in_its_dock_and_leaves_it_there() {
+        let (x, dock, probe) = docked([70.0, 45.0], [0.0; 3]);
         let now = Clock::from_ticks(0);
         x.set_enabled(true);
         x.passes(dock);
@@ -138,12 +142,8 @@ mod tests {
 
     #[test]
     fn in_its_dock_it_touches_no_bed() {
-        let printer = DefaultPrinter::read();
-        let [x, y, z] = [0, 1, 2].map(|place| Arc::new(Axis::new(&printer.axes[place])));
-        let bed = Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z));
-        // The nozzle is 12 mm above the bed, and the probe 20 mm below it.
-        let dock = Arc::new(Dock::new(x.rail().clone(), y.rail().clone(), [60.0, 45.0]));
-        let probe = switch(bed, [0.0, 0.0, -20.0], Some(dock.clone()));
+        // 20 mm below the nozzle, which is 12 mm above the bed.
+        let (x, dock, probe) = docked([60.0, 45.0], [0.0, 0.0, -20.0]);
         let now = Clock::from_ticks(0);
         assert!(probe.sense(false, now), "it is in the dock");
         dock.passed();

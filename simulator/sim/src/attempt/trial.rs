@@ -189,6 +189,12 @@ impl<'a> Trial<'a> {
         &self.own.config
     }
 
+    /// A macro of the user's. klippy takes its name in any case.
+    pub(super) fn macro_named(&self, name: &str) -> Option<&'a Section> {
+        let has_name = |section: &&Section| section.own_name().is_some_and(|own| own.eq_ignore_ascii_case(name));
+        self.config().of_kind("gcode_macro").find(has_name)
+    }
+
     /// The place of a section that klippy has.
     pub(super) fn place(&self, section: &str) -> Option<Place> {
         let section = self.config().section(section).filter(|section| !self.is_left_out(section))?;

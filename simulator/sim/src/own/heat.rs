@@ -43,8 +43,7 @@ fn has_sensor(kind: &str) -> bool {
 /// The first sensor that a combined sensor reads: the name of its section.
 fn first_sensor(section: &Section) -> Option<&str> {
     let is_combined = section.text("sensor_type") == Some("temperature_combined");
-    let list = section.text("sensor_list").filter(|_| is_combined)?;
-    list.split([',', '\n']).map(str::trim).find(|name| !name.is_empty())
+    section.list("sensor_list", ',').first().copied().filter(|_| is_combined)
 }
 
 impl Translator<'_> {
@@ -66,8 +65,8 @@ impl Translator<'_> {
                 None => Ok(()),
             };
         };
-        let heats = |of: &Section| first_sensor(of).and_then(|sensor| self.config.section(sensor)).is_some();
-        if heats(section) && section.text("heater_pin").is_some() {
+        let measured = first_sensor(section).and_then(|name| self.config.section(name));
+        if measured.is_some() && section.text("heater_pin").is_some() {
             // What its first sensor measures has the heater.
             return Ok(());
         }

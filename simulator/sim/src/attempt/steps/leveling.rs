@@ -63,14 +63,9 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
 fn with_probe<'a>(trial: &Trial<'_>, commands: &[&'a str]) -> Vec<&'a str> {
     const TAKE_UP: &str = "ATTACH_PROBE_LOCK";
     const PUT_BACK: &str = "DOCK_PROBE_UNLOCK";
-    let needs = [TAKE_UP, PUT_BACK].into_iter().all(|name| has_macro(trial, name));
+    let needs = [TAKE_UP, PUT_BACK].into_iter().all(|name| trial.macro_named(name).is_some());
     let [before, behind] = [TAKE_UP, PUT_BACK].map(|name| needs.then_some(name));
     before.into_iter().chain(commands.iter().copied()).chain(behind).collect()
-}
-
-fn has_macro(trial: &Trial<'_>, name: &str) -> bool {
-    let mut macros = trial.config().of_kind("gcode_macro");
-    macros.any(|section| section.own_name().is_some_and(|own| own.eq_ignore_ascii_case(name)))
 }
 
 /// How far apart they may be: as far as the user tolerates. The motors are farther apart than the points.
@@ -110,7 +105,7 @@ pub(super) fn probed(trial: &mut Trial<'_>) -> Seen {
     for command in with_probe(trial, &[&middle, "PROBE_CALIBRATE", "ABORT"]) {
         trial.gcode(command, LONG)?;
     }
-    if has_macro(trial, "STOW_PROBE") {
+    if trial.macro_named("STOW_PROBE").is_some() {
         // A macro with the name of PROBE_CALIBRATE may have taken the probe up.
         let _ = trial.host.gcode("STOW_PROBE", LONG);
     }

@@ -3,8 +3,6 @@
 
 use std::collections::BTreeSet;
 
-use pinion_printer_config::Section;
-
 use super::heaters::heat_extruder;
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;
@@ -60,8 +58,7 @@ pub(super) fn macros(trial: &mut Trial<'_>) -> Seen {
 
 /// The parameters of a macro with temperatures: those that its text asks for, and the usual ones.
 fn parameters(trial: &Trial<'_>, name: &str) -> String {
-    let has_name = |section: &&Section| section.own_name().is_some_and(|own| own.to_uppercase() == name);
-    let text = trial.config().of_kind("gcode_macro").find(has_name).and_then(|section| section.text("gcode"));
+    let text = trial.macro_named(name).and_then(|section| section.text("gcode"));
     let asked = text.unwrap_or_default().split("params.").skip(1);
     let asked =
         asked.map(|rest| rest.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').next().unwrap_or_default());
