@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use log::{error, info, warn};
+use log::{debug, error, info, warn};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
@@ -175,7 +175,9 @@ pub fn run(
     let (realtime, margin) = (options.realtime, options.margin);
     // Later threads are in real time.
     started(pinion_linux::clock::watch_tick())?;
-    helpers::give_back_unused();
+    if let Err(error) = sys::give_back_unused() {
+        debug!("memory that only the start needed is kept: {error}");
+    }
     if realtime {
         realtime::lock_memory();
     }

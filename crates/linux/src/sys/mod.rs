@@ -24,7 +24,7 @@ mod pages;
 mod registers;
 
 pub use filter::allow_only_reading;
-pub use pages::give_back_unused;
+pub use pages::{give_back_unused, trim_heap};
 pub use registers::{Register, Registers};
 
 /// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).

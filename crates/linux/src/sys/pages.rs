@@ -10,6 +10,12 @@ use std::ptr::{self, NonNull};
 
 use nix::sys::mman::{MmapAdvise, madvise};
 
+/// Gives back the free memory of the allocator.
+pub fn trim_heap() {
+    // SAFETY: takes a number. The allocator gives back only what is free.
+    unsafe { libc::malloc_trim(0) };
+}
+
 /// Gives back the free memory of the allocator, and the unchanged pages of the program's libraries. The kernel maps such a
 /// page again when it is used. Loading libraries touches thousands of pages that are never used again. Call it before
 /// memory is locked.
@@ -25,8 +31,7 @@ pub fn give_back_unused() -> io::Result<()> {
         unsafe { madvise(start, range.len(), MmapAdvise::MADV_DONTNEED) }?;
     }
     // It comes last, because reading the mappings takes memory, too.
-    // SAFETY: takes a number. The allocator gives back only what is free.
-    unsafe { libc::malloc_trim(0) };
+    trim_heap();
     Ok(())
 }
 

@@ -5,7 +5,7 @@
 use std::ffi::CStr;
 use std::fs;
 
-use log::{debug, warn};
+use log::warn;
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
@@ -38,8 +38,8 @@ impl Helpers {
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
     pub fn start(recording: &Recording, guarded: bool, searches: bool, rights: u32) -> Result<Helpers, Trouble> {
-        // Each of them would keep a copy.
-        give_back_unused();
+        // Each of them would keep a copy. Pages of files are not copied.
+        sys::trim_heap();
         // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
         let guardian = guarded.then(|| Guardian::start(recording)).transpose()?;
@@ -50,13 +50,6 @@ impl Helpers {
             );
         }
         Ok(Helpers { guardian, search })
-    }
-}
-
-/// Gives back the memory that only the start needed.
-pub(crate) fn give_back_unused() {
-    if let Err(error) = sys::give_back_unused() {
-        debug!("memory that only the start needed is kept: {error}");
     }
 }
 
