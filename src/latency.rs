@@ -22,7 +22,10 @@ use pinion_system::complete::offering;
 use pinion_system::files::Output;
 use pinion_system::running::{print_at_risk, print_of_another};
 
+mod figures;
 mod pin;
+
+pub use figures::{EdgeCost, Figures, HalfFigures, LateUs, Latency};
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
@@ -33,6 +36,9 @@ pub(crate) struct LatencyArgs {
     /// Draw the histograms
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
+    /// Print JSON, for example for the option --latency of pinion sim
+    #[arg(long)]
+    json: bool,
     /// Toggle this line, which nothing may be connected to and nobody may hold, for two seconds, and print what an edge
     /// costs
     #[arg(long, value_name = "NAME", conflicts_with_all = ["seconds", "svg"], value_hint = clap::ValueHint::Other)]
@@ -53,7 +59,11 @@ pub(crate) fn run(args: &LatencyArgs) -> ExitCode {
     }
     if let Some(pin) = &args.pin {
         let measured = pin::measure(pin, args.fast_gpio);
-        return measured.and_then(|text| print(&Page::text(&text))).map_or_else(failed, |()| ExitCode::SUCCESS);
+        let page = measured.and_then(|(text, cost)| match args.json {
+            true => Figures::of_edge(Some(cost)).json().map(|json| Page::json(&json)),
+            false => Ok(Page::text(&text)),
+        });
+        return page.and_then(|page| print(&page)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     let svg = match args.svg.as_deref().map(|path| Output::check(path, &[])).transpose() {
         Ok(svg) => svg,
@@ -66,7 +76,11 @@ pub(crate) fn run(args: &LatencyArgs) -> ExitCode {
     };
     let verdict = judge(&halves, scheduling);
     let drawn = svg.map_or(Ok(()), |svg| svg.write(|out| out.write_all(draw(&halves, verdict.fitness).as_bytes())));
-    print(&Page::text(&report(&halves, &verdict))).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
+    let page = match args.json {
+        true => Figures::of_latency(&halves, &verdict).json().map(|json| Page::json(&json)),
+        false => Ok(Page::text(&report(&halves, &verdict))),
+    };
+    page.and_then(|page| print(&page)).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 fn report(halves: &[Half; 2], verdict: &Assessment) -> String {

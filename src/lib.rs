@@ -33,7 +33,7 @@ mod check;
 pub mod console;
 pub mod dict;
 mod doctor;
-mod latency;
+pub mod latency;
 mod link;
 pub mod logging;
 pub mod page;

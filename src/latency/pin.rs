@@ -10,7 +10,7 @@ use pinion_linux::pins::{Names, line_number};
 use pinion_linux::sysfs::Sysfs;
 use pinion_linux::{Inventory, LinuxBoard};
 
-use super::computer_name;
+use super::{EdgeCost, computer_name};
 
 /// How long each of the two ways is measured.
 const SPAN: Duration = Duration::from_secs(1);
@@ -30,23 +30,30 @@ struct Cost {
 /// # Errors
 ///
 /// There is no such line, or it is in use.
-pub(super) fn measure(name: &str, wish: FastGpio) -> Result<String, String> {
+pub(super) fn measure(name: &str, wish: FastGpio) -> Result<(String, EdgeCost), String> {
     let line = find(name)?;
+    let mut edge = EdgeCost { line: name.to_owned(), kernel_ns: 0.0, registers_ns: None };
     let mut text = format!("{name}, {} s each way:\n", SPAN.as_secs());
     for (way, wish) in [("kernel", FastGpio::Off), ("registers", wish)] {
         let mut board = LinuxBoard::new(None, wish);
         let output = Direction::Output { level: false, shutdown_value: false };
         let claimed = board.line(line, output).map_err(|stop| stop.to_string())?;
         let cost = match wish == FastGpio::Off || claimed.line.is_fast() {
-            true => cost(&*claimed.line).map(|cost| cost.to_string()),
-            false => Ok("cannot be used: the line above says why".to_owned()),
+            true => cost(&*claimed.line).map(Some),
+            false => Ok(None),
         };
         // A line that nobody uses is an input.
         let _ = claimed.line.set_direction(Direction::Input(Bias::None));
-        text += &format!("  {way:<9}  {}\n", cost?);
+        let cost = cost?;
+        let said = cost.as_ref().map_or_else(|| "cannot be used: the line above says why".to_owned(), Cost::to_string);
+        text += &format!("  {way:<9}  {said}\n");
+        match wish {
+            FastGpio::Off => edge.kernel_ns = cost.map_or(0.0, |cost| cost.p50),
+            _ => edge.registers_ns = cost.map(|cost| cost.p50),
+        }
         text += hidden(&*claimed.line);
     }
-    Ok(text + &format!("on {}\n", computer_name()))
+    Ok((text + &format!("on {}\n", computer_name()), edge))
 }
 
 /// The limits of the measurement of this line.

@@ -261,6 +261,10 @@ gcode:
   {% set twice = lock.acquire() %}
 ";
 
+/// What `pinion latency --pin GPIO17 --json` writes.
+const EDGE: &str = r#"{ "form": 1, "version": "0.1.0", "computer": "a board",
+                        "edge": { "line": "GPIO17", "kernel_ns": 2000.0, "registers_ns": null } }"#;
+
 /// A print of a file on the built-in printer: whether it passed, and its report.
 fn printed(checkout: &Path, gcode: &str) -> Value {
     let home = tempfile::tempdir().unwrap();
@@ -270,9 +274,11 @@ fn printed(checkout: &Path, gcode: &str) -> Value {
     let config = Command::new(pinion_path()).args(["sim", "--print-config"]).output().unwrap().stdout;
     fs::write(place("printer.cfg"), [config, MORE.into()].concat()).unwrap();
     fs::write(place("a.gcode"), gcode).unwrap();
+    fs::write(place("edge.json"), EDGE).unwrap();
     let mut command = Command::new(pinion_path());
     command.arg("sim").arg(place("printer.cfg")).arg("--print").arg(place("a.gcode")).arg("--json");
     command.arg("--klipper").arg(checkout).args(["--python", &python(), "--plot"]).arg(place("plot.svg"));
+    command.arg("--latency").arg(place("edge.json"));
     let done = command.output().unwrap();
     let log = String::from_utf8_lossy(&done.stderr);
     let mut report: Value = serde_json::from_slice(&done.stdout).unwrap_or_else(|error| panic!("{error}\n{log}"));
@@ -297,6 +303,11 @@ fn a_file_is_printed_and_each_time_the_same() {
     assert!(report["phases"]["paused"].as_f64().unwrap() > 25.0, "{report}");
     let x = report["motors"].as_array().unwrap().iter().find(|motor| motor["name"] == "x").unwrap();
     assert!((x["mm_per_s"].as_f64().unwrap() - 20.0).abs() < 2.0, "{x}");
+    let steps_per_s: f64 =
+        report["motors"].as_array().unwrap().iter().map(|motor| motor["steps_per_s"].as_f64().unwrap()).sum();
+    let share = report["limits"]["edges_share"].as_f64().unwrap();
+    // Two edges a step. The report has whole steps.
+    assert!((share - steps_per_s * 4e-6).abs() < 1e-5, "{report}");
     assert_eq!(printed(&checkout, gcode), report);
 }
 

@@ -270,6 +270,14 @@ fn latency_judges_the_computer() {
         for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: ", "to share: Pinion "] {
             assert!(text.contains(part), "no \"{part}\" in:\n{text}");
         }
+        let measured = output(&["latency", "--seconds", "2", "--json"]);
+        let figures: Value = serde_json::from_slice(&measured.stdout).unwrap();
+        let latency = &figures["latency"];
+        assert!(latency["fit_for_steppers"].is_boolean() && figures["computer"].is_string(), "{figures}");
+        for half in ["idle", "under_load"] {
+            let late = &latency[half]["edges"];
+            assert!(late["p999"].as_f64() <= late["max"].as_f64() && late["events"].as_u64() > Some(0), "{figures}");
+        }
     });
 }
 

@@ -34,6 +34,10 @@ pub(crate) struct OwnArgs {
     /// Draw speed, temperatures and flow of --print into this file
     #[arg(long, value_name = "FILE.svg", requires = "print")]
     plot: Option<PathBuf>,
+    /// Say whether the computer with these figures can make the steps of --print. The file is an output of "pinion latency
+    /// --json", and a second one of "pinion latency --pin NAME --json"
+    #[arg(long, value_name = "FILE.json", requires = "print")]
+    latency: Vec<PathBuf>,
     /// The checkout of Klipper or Kalico that judges printer.cfg, and for --try and --print; KLIPPER_DIR by default, or
     /// the one of this computer's klippy
     #[arg(long, value_name = "DIR")]
@@ -135,7 +139,12 @@ impl OwnArgs {
         let klipper = attempt::klipper(self.klipper())?;
         let python = attempt::python(self.python.as_deref(), &klipper);
         let print = |file: &PathBuf| {
-            Task::Print(PrintOptions { file: file.clone(), layers: self.layers, plot: self.plot.clone() })
+            Task::Print(PrintOptions {
+                file: file.clone(),
+                layers: self.layers,
+                plot: self.plot.clone(),
+                latency: self.latency.clone(),
+            })
         };
         let task = self.print.as_ref().map(print).or(self.speed.map(Task::Serve)).unwrap_or(Task::Try);
         Ok(Some(Attempt {

@@ -2,6 +2,7 @@
 //! `pinion sim PRINTER.CFG --print FILE`: a klippy prints the file on the simulated printer, in one clock.
 
 mod file;
+mod limits;
 mod phase;
 mod plot;
 mod report;
@@ -26,6 +27,7 @@ use super::trial::homes_by_stall;
 use super::{Attempt, Form, Host, Watching, unwritten};
 use crate::own::serve::{Folder, Own};
 use file::GcodeFile;
+use limits::Limits;
 use phase::{Phase, Sight};
 use report::{Heated, Printed, Stopped};
 
@@ -59,6 +61,8 @@ pub(crate) struct PrintOptions {
     /// Report each layer.
     pub(crate) layers: bool,
     pub(crate) plot: Option<PathBuf>,
+    /// Outputs of `pinion latency --json`.
+    pub(crate) latency: Vec<PathBuf>,
 }
 
 /// The printer at an instant of a print.
@@ -87,6 +91,7 @@ pub(crate) fn run(
 ) -> Result<Option<bool>, Trouble> {
     let plot = options.plot.as_deref().map(|path| Output::check(path, &[printer, &options.file])).transpose();
     let plot = plot.map_err(Trouble::new)?;
+    let limits = Limits::read(&options.latency).map_err(Trouble::new)?;
     let file = GcodeFile::read(&options.file)?;
     let began = Instant::now();
     offer(&file, own, folder)?;
@@ -107,7 +112,7 @@ pub(crate) fn run(
         unknown: Vec::new(),
         config: &own.config,
     };
-    let printed = printing.run();
+    let printed = Printed { limits, ..printing.run() };
     let took = began.elapsed();
     printing.host.watch.progress.end();
     if ended.load(Ordering::SeqCst) {
@@ -206,6 +211,7 @@ impl Print<'_> {
             layers: layers(&points),
             filament_mm: points.iter().map(|point| f64::from(point.laid_mm)).sum(),
             motors: self.host.watch.paces.take().map_or_else(Vec::new, |paces| paces.most().cloned().collect()),
+            limits: None,
             heaters: self.heaters.clone(),
             compared,
             lost,

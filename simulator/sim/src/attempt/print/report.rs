@@ -8,6 +8,7 @@ use pinion::page::Page;
 use pinion_model::{Comparison, Pace};
 use serde_json::{Value, json};
 
+use super::limits::Limits;
 use super::phase::Phase;
 
 /// A heater during a print.
@@ -62,6 +63,8 @@ pub(super) struct Printed {
     pub(super) layers: Vec<(f64, f64)>,
     pub(super) filament_mm: f64,
     pub(super) motors: Vec<Pace>,
+    /// Figures of a computer that may have to make these steps.
+    pub(super) limits: Option<Limits>,
     pub(super) heaters: Vec<Heated>,
     pub(super) compared: Result<Comparison, String>,
     /// Axes that lost steps.
@@ -86,6 +89,11 @@ impl Printed {
     /// Whether the print came to its end, with all its steps.
     pub(super) fn passed(&self) -> bool {
         self.stopped.is_none() && self.lost.is_empty()
+    }
+
+    /// The motors that have moved.
+    fn moved(&self) -> Vec<&Pace> {
+        self.motors.iter().filter(|pace| pace.steps_per_s > 0.0).collect()
     }
 
     /// The report for people.
@@ -119,12 +127,15 @@ impl Printed {
                 if *off > 0.0 { format!(", at most {off:.1} C from its target once there") } else { String::new() };
             page.line(format_args!("{name}: target {target:.0} C, highest {most:.1} C{held}"));
         }
-        let moved: Vec<&Pace> = self.motors.iter().filter(|pace| pace.steps_per_s > 0.0).collect();
+        let moved = self.moved();
         if !moved.is_empty() {
             page.line("motor                steps/s      mm/s   mm/s2, the highest of each");
         }
-        for Pace { name, steps_per_s, mm_per_s, mm_per_s2 } in moved {
+        for Pace { name, steps_per_s, mm_per_s, mm_per_s2 } in &moved {
             page.line(format_args!("  {name:<17} {steps_per_s:>8.0} {mm_per_s:>9.1} {mm_per_s2:>7.0}"));
+        }
+        if let Some(limits) = &self.limits {
+            limits.lines(&mut page, &moved);
         }
         match &self.compared {
             Ok(found) => page.line(format_args!(
@@ -169,6 +180,7 @@ impl Printed {
                 "mm_per_s": tenth(pace.mm_per_s),
                 "mm_per_s2": pace.mm_per_s2.round(),
             })).collect::<Vec<Value>>(),
+            "limits": self.limits.as_ref().map(|limits| limits.json(&self.moved())),
             "heaters": self.heaters.iter().map(|heater| json!({
                 "name": heater.name,
                 "target_celsius": tenth(heater.target),
