@@ -16,8 +16,11 @@ use super::{Attempt, Host, unwritten};
 use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
 
-/// How long homing, leveling or a macro may take.
+/// How long homing or a macro may take.
 pub(super) const LONG: Duration = Duration::from_secs(1800);
+/// How long a leveling may take, also in a macro that begins a print. A mesh of 20 by 20 points with three samples each
+/// needs more than an hour.
+pub(super) const LEVELING: Duration = Duration::from_secs(4 * 3600);
 /// How long it may take until a fan turns.
 pub(super) const SOON: Duration = Duration::from_secs(30);
 /// How long klippy has to be ready.

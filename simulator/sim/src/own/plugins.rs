@@ -19,8 +19,8 @@ const Z_OFFSET_MM: f64 = 1.0;
 /// The pin of a stand-in, on the main MCU.
 pub(super) const PIN: &str = "pinion_stand_in";
 /// The sections of the file that Mainsail and Fluidd bring along.
-const OF_INTERFACE: &str =
-    "[virtual_sdcard]\npath: ~/printer_data/gcodes\n[pause_resume]\n[display_status]\n[respond]\n";
+const OF_INTERFACE: &str = "[virtual_sdcard]\npath: ~/printer_data/gcodes\non_error_gcode: CANCEL_PRINT\n\
+                            [pause_resume]\n[display_status]\n[respond]\n";
 /// Longest source of klippy.
 const SOURCE_MAX: u64 = 4 << 20;
 
@@ -119,8 +119,8 @@ impl LeftOut {
     }
 }
 
-/// Whether klippy cannot read a section without the ones that are left out: it measures with their chip, or has a pin of
-/// theirs. The printer itself stays.
+/// Whether klippy cannot use a section without the ones that are left out: it measures with their chip, has a pin of
+/// theirs, or is a macro in the place of a command and asks for their status. The printer itself stays.
 fn hangs_on(config: &Config, section: &Section, left_out: &[String]) -> bool {
     let measures = || {
         ["accel_chip", "accel_chip_x", "accel_chip_y"]
@@ -140,7 +140,18 @@ fn hangs_on(config: &Config, section: &Section, left_out: &[String]) -> bool {
         })
     };
     let is_printers = section.kind().starts_with("stepper") || section.kind().starts_with("extruder");
-    measures() || !is_printers && section.kind() != "heater_bed" && has_pin()
+    // A macro in the place of a command. Without the macro the command still does its work.
+    let asks = || {
+        let asks_for = |name: &String| {
+            let word = format!("printer.{name}");
+            let text = section.text("gcode").unwrap_or_default();
+            let ends =
+                |at: usize| !text[at + word.len()..].starts_with(|next: char| next.is_alphanumeric() || next == '_');
+            text.match_indices(&word).any(|(at, _)| ends(at))
+        };
+        section.text("rename_existing").is_some() && left_out.iter().any(asks_for)
+    };
+    measures() || asks() || !is_printers && section.kind() != "heater_bed" && has_pin()
 }
 
 /// What klippy needs of an included file that is not there.
@@ -230,6 +241,14 @@ mod tests {
         let text = "[beacon]\nserial: x\n[adxl345]\ncs_pin: beacon:PA3\n[resonance_tester]\naccel_chip: adxl345\n\
                     [adxl345 bed]\ncs_pin: bed:PA3\n[mcu bed]\nserial: y\n[stepper_x]\nendstop_pin: beacon:PA1\n";
         assert_eq!(left_out(text, None).0, ["beacon", "adxl345", "resonance_tester"]);
+    }
+
+    #[test]
+    fn a_command_loses_the_macro_in_its_place_that_asks_for_a_plugin_s_status() {
+        let text = "[toolchanger]\n[gcode_macro M104]\nrename_existing: M104.1\ngcode: {printer.toolchanger.tool}\n\
+                    [gcode_macro M109]\nrename_existing: M109.1\ngcode: {printer.toolchanger_led}\n\
+                    [gcode_macro TOOL]\ngcode: {printer.toolchanger.tool}\n";
+        assert_eq!(left_out(text, None).0, ["toolchanger", "gcode_macro M104"]);
     }
 
     #[test]

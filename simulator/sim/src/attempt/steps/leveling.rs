@@ -1,15 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Leveling with a probe, and the calibration of the probe.
 
-use std::time::Duration;
 
 use pinion_printer_config::Limit;
 
 use super::{Seen, skipped};
-use crate::attempt::trial::{LONG, Trial, travel};
+use crate::attempt::trial::{LEVELING, LONG, Trial, travel};
 
-/// How long a leveling may take. A mesh of 20 by 20 points with three samples each needs more than an hour.
-const LEVELING: Duration = Duration::from_secs(4 * 3600);
 /// How level a gantry or bed has to be.
 const LEVEL_MM: f64 = 0.1;
 

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use super::heaters::heat_extruder;
 use super::{Seen, skipped};
 use crate::attempt::report::Outcome;
-use crate::attempt::trial::{LONG, Trial, travel};
+use crate::attempt::trial::{LEVELING, LONG, Trial, travel};
 
 /// Usual names of theirs.
 const STARTS: [&str; 4] = ["START_PRINT", "PRINT_START", "START_GCODE", "BEGIN_PRINT"];
@@ -30,11 +30,11 @@ pub(super) fn macros(trial: &mut Trial<'_>) -> Seen {
     let [x, y] = [0, 1].map(|axis: usize| (low[axis] + high[axis]) / 2.0);
     for name in &found {
         let script = format!("{name} {}", parameters(trial, name));
-        let result = match trial.gcode(&script, LONG) {
+        let result = match trial.gcode(&script, LEVELING) {
             // Some expect that the slicer has heated before.
             Err(Outcome::Failed { cause, .. }) if cause.contains("Extrude below minimum temp") => {
                 heat_extruder(trial)?;
-                trial.gcode(&script, LONG)
+                trial.gcode(&script, LEVELING)
             }
             result => result,
         };
