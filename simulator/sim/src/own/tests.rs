@@ -293,17 +293,37 @@ fn a_probe_as_endstop_leaves_position_endstop_without_a_meaning() {
 }
 
 #[test]
-fn a_heater_with_a_combined_sensor_heats_what_its_first_sensor_measures() {
-    let dryer = "[temperature_sensor box]\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: PA4\n[heater_generic dryer]\n\
-                 heater_pin: PD9\nmax_power: 0.5\nsensor_type: temperature_combined\nsensor_list: temperature_sensor box,\n  \
-                 temperature_host a\ncombination_method: mean\nmaximum_deviation: 50\ncontrol: watermark\n\
-                 min_temp: 0\nmax_temp: 90\n[extruder]";
-    let description = translated(&PRINTER.replace("[extruder]", dryer)).unwrap().description;
-    let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
-    let found: Vec<_> = heaters.filter(|heater| heater.get("pin") == Some(&Value::from("PD9"))).collect();
-    let [heater] = found[..] else { panic!("{description}") };
-    assert_eq!(heater["name"].as_str(), Some("box"));
-    assert!(heater["heater_watts"].as_float().unwrap() > 0.0);
+fn a_heater_with_a_combined_sensor_heats_the_first_sensor_that_it_can_heat() {
+    let sensor = "[temperature_sensor box]\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: PA4\n\
+                  [temperature_sensor pi]\nsensor_type: temperature_host\n";
+    let heater = |name: &str, pin: &str, sensors: &str| {
+        format!(
+            "[heater_generic {name}]\nheater_pin: {pin}\nmax_power: 0.5\nsensor_type: temperature_combined\n\
+             sensor_list: {sensors}\ncombination_method: mean\nmaximum_deviation: 50\ncontrol: watermark\n\
+             min_temp: 0\nmax_temp: 90\n"
+        )
+    };
+    let named = |text: String, pin: &str| {
+        let description = translated(&PRINTER.replace("[extruder]", &(text + "[extruder]"))).unwrap().description;
+        let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
+        let found: Vec<_> = heaters.filter(|heater| heater.get("pin") == Some(&Value::from(pin))).collect();
+        let [heater] = found[..] else { panic!("{pin}: {description}") };
+        assert!(heater["heater_watts"].as_float().unwrap() > 0.0);
+        heater["name"].as_str().unwrap().to_owned()
+    };
+    let both = "temperature_sensor box,\n  temperature_sensor pi";
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", both), "PD9"), "box");
+    let host_first = "temperature_sensor pi, temperature_sensor box";
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", host_first), "PD9"), "box");
+    // A heater that can heat none of its sensors, because the box has one, or the bed has its own.
+    let two = || sensor.to_owned() + &heater("dryer", "PD9", both) + &heater("chamber", "PD10", both);
+    assert_eq!([named(two(), "PD9"), named(two(), "PD10")], ["box", "chamber"]);
+    for sensors in ["temperature_sensor pi", "extruder, temperature_sensor pi"] {
+        assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", sensors), "PD9"), "dryer");
+    }
+    let of_extruder = PRINTER.split("[extruder]").nth(1).unwrap().split("heater_pin:").nth(1).unwrap();
+    let of_extruder = of_extruder.lines().next().unwrap().trim();
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", "extruder"), of_extruder), "extruder");
 }
 
 #[test]
