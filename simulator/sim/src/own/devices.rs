@@ -6,7 +6,7 @@ use pinion_printer_config::{Limit, Section, Trouble};
 use super::description::Entry;
 use super::known::is_left_over;
 use super::plugins::{PIN, StandIn};
-use super::translate::Translator;
+use super::translator::Translator;
 
 /// How high a coil is above the nozzle's tip.
 const COIL_MM: f64 = 2.5;

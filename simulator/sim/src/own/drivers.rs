@@ -6,7 +6,7 @@ use pinion_printer_config::{Section, Trouble};
 
 use super::description::Entry;
 use super::known::motor_of;
-use super::translate::Translator;
+use super::translator::Translator;
 
 /// Highest address of a driver on a UART.
 const ADDRESS_MAX: i64 = 3;

@@ -5,7 +5,7 @@ use pinion_printer_config::{Config, Limit, Section, Trouble};
 
 use super::description::Entry;
 use super::sensors::{is_known, mcu_at_40, sensor};
-use super::translate::{Pace, Translator};
+use super::translator::{Pace, Translator};
 
 /// Temperature of the surroundings.
 const AMBIENT_CELSIUS: f64 = 25.0;

@@ -111,6 +111,37 @@ pub(super) fn motor_of(driver: &Section) -> &str {
     driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
 }
 
+/// The kinematics of Klipper and Kalico. Of names within each other, the longer one comes first.
+const KINEMATICS: [&str; 15] = [
+    "limited_cartesian",
+    "limited_corexy",
+    "limited_corexz",
+    "hybrid_corexy",
+    "hybrid_corexz",
+    "generic_cartesian",
+    "rotary_delta",
+    "cartesian",
+    "corexy",
+    "corexz",
+    "deltesian",
+    "delta",
+    "polar",
+    "winch",
+    "none",
+];
+
+/// Whether klippy has these kinematics.
+pub(super) fn has_kinematics(kinematics: &str) -> bool {
+    KINEMATICS.contains(&kinematics)
+}
+
+/// The kinematics that stand for these: their own, or those that the name of a plugin's ends with.
+pub(super) fn simulated_kinematics(kinematics: &str) -> Option<&'static str> {
+    KINEMATICS
+        .into_iter()
+        .find(|known| kinematics == *known || kinematics.strip_suffix(known).is_some_and(|rest| rest.ends_with('_')))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
