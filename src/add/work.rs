@@ -217,8 +217,7 @@ impl Work<'_> {
         self.report.line("Next:");
         next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
         if self.device.resonance
-            && let Some(remedy) =
-                target.klippy(self.computer).and_then(|klippy| crate::doctor::without_numpy(self.computer, &klippy))
+            && let Some(remedy) = target.klippy(self.computer).and_then(|klippy| klippy.without_numpy(self.computer))
         {
             self.report.line(format_args!("SHAPER_CALIBRATE needs numpy first: {remedy}"));
         }

@@ -42,6 +42,30 @@ pub struct Klippy {
 }
 
 impl Klippy {
+    /// The command that installs numpy for a klippy that has none. `None` also if that is not known.
+    pub fn without_numpy(&self, computer: &Computer) -> Option<String> {
+        let python = self.python.as_deref().filter(|python| computer.exists(python))?;
+        // A virtual environment has its packages beside its Python. It may also use the system's.
+        let home = python.parent()?.parent()?;
+        let settings = computer.text(home.join("pyvenv.cfg"))?;
+        let has = |home: &Path| {
+            let folders = [
+                "lib/python3*/site-packages/numpy",
+                "lib/python3*/dist-packages/numpy",
+                "lib/python3/dist-packages/numpy",
+            ];
+            folders.iter().any(|folder| {
+                computer.matching(home.join(folder)).iter().any(|path| computer.exists(computer.name(path)))
+            })
+        };
+        let is_system_s = settings.lines().any(|line| line.replace(' ', "") == "include-system-site-packages=true");
+        if has(home) || is_system_s && [Path::new("/usr"), Path::new("/usr/local")].into_iter().any(has) {
+            return None;
+        }
+        let pip: PathBuf = home.join("bin/pip");
+        Some(format!("sudo -u {} {} install numpy", word(&self.who.name), word(pip.display())))
+    }
+
     /// Its configuration, if the doctor can use it.
     pub fn printer(&self) -> Option<&Printer> {
         self.printer.as_ref()?.as_ref().ok()
