@@ -167,14 +167,12 @@ impl Translator<'_> {
 
     /// A sensor that is a chip of its own.
     fn chip_thermometer(&mut self, section: &Section, kind: &str, heater: &str) -> Result<(), Trouble> {
-        let part = Entry::default().set("heater", heater);
         let number = |key: &str, default: f64| section.number(key, Limit::Any).map(|n| n.unwrap_or(default));
         match kind {
             "MAX6675" | "MAX31855" | "MAX31856" | "MAX31865" => {
-                let Some((bus, select)) = self.spi(section, "sensor_pin")? else { return Ok(()) };
+                let Some(part) = self.chip_on_spi(section, "sensor_pin", "thermocouple")? else { return Ok(()) };
                 let name = self.out.name("part", heater);
-                let part = part.set("kind", "thermocouple").set("chip", kind.to_lowercase()).set("name", name);
-                let part = part.set("bus", bus).set_if("select_pin", select);
+                let part = part.set("heater", heater).set("chip", kind.to_lowercase()).set("name", name);
                 let part = match kind {
                     "MAX31865" => {
                         let part = part.set("rtd_ohm", number("rtd_nominal_r", 100.0)?);
@@ -192,7 +190,8 @@ impl Translator<'_> {
                     self.note(section, &cause, "name one in /sys/bus/w1/devices, such as 28-0123456789ab");
                 }
                 let name = self.out.name("part", heater);
-                self.out.add("part", part.set("kind", "ds18b20").set("name", name).set("serial", serial));
+                let part = Entry::of_kind("ds18b20").set("heater", heater);
+                self.out.add("part", part.set("name", name).set("serial", serial));
             }
             "BME280" | "HTU21D" | "SHT21" | "SI7013" | "SI7020" | "SI7021" | "SHT3X" | "AHT10" | "AHT1X" | "AHT2X"
             | "AHT3X" | "LM75" => {
@@ -203,14 +202,9 @@ impl Translator<'_> {
                     "LM75" => ("lm75", 72),
                     _ => ("htu21d", 64),
                 };
-                let address = section.whole("i2c_address", 0)?.unwrap_or(address);
-                let bus = self.i2c(section)?;
-                if !self.out.is_new_chip(&bus, address) {
-                    return Ok(());
-                }
+                let Some(part) = self.chip_on_i2c(section, address, "i2c_sensor")? else { return Ok(()) };
                 let name = self.out.name("part", heater);
-                let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
-                self.out.add("part", part.set("address", address));
+                self.out.add("part", part.set("heater", heater).set("name", name).set("chip", chip));
             }
             _ if is_known(self.config, kind) => {}
             _ => {

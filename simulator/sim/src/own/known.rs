@@ -45,23 +45,7 @@ pub(crate) fn kind_of(word: &str) -> Kind {
 pub(super) fn near(word: &str) -> Option<&'static str> {
     // A short word of a plugin is near to many others.
     const LETTERS_MIN: usize = 5;
-    known().find(|known| word.len() >= LETTERS_MIN && is_near(word, known))
-}
-
-/// Whether one edit makes one word of the other: a letter more, less or another one, or two that are swapped.
-fn is_near(one: &str, other: &str) -> bool {
-    let (mut one, mut other): (Vec<char>, Vec<char>) = (one.chars().collect(), other.chars().collect());
-    for _ in 0..2 {
-        // The common end goes, then the common beginning.
-        while one.last().is_some_and(|last| other.last() == Some(last)) {
-            one.pop();
-            other.pop();
-        }
-        one.reverse();
-        other.reverse();
-    }
-    let is_swapped = one.len() == 2 && other.len() == 2 && one[0] == other[1] && one[1] == other[0];
-    one != other && (one.len().max(other.len()) == 1 || is_swapped)
+    known().find(|known| word.len() >= LETTERS_MIN && strsim::osa_distance(word, known) == 1)
 }
 
 /// Sections of klippy without a module of their own.

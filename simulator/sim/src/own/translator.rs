@@ -184,6 +184,19 @@ impl Translator<'_> {
         Ok(Some((bus, select)))
     }
 
+    /// The part of a chip on SPI. `None` if its select pin is no pin of an MCU.
+    pub(super) fn chip_on_spi(&mut self, section: &Section, key: &str, kind: &str) -> Result<Option<Entry>, Trouble> {
+        let found = self.spi(section, key)?;
+        Ok(found.map(|(bus, select)| Entry::of_kind(kind).set("bus", bus).set_if("select_pin", select)))
+    }
+
+    /// The part of a chip on I2C. `None` if another section has made it.
+    pub(super) fn chip_on_i2c(&mut self, section: &Section, usual: i64, kind: &str) -> Result<Option<Entry>, Trouble> {
+        let (bus, address) = (self.i2c(section)?, section.whole("i2c_address", 0)?.unwrap_or(usual));
+        let is_new = self.out.is_new_chip(&bus, address);
+        Ok(is_new.then(|| Entry::of_kind(kind).set("bus", bus).set("address", address)))
+    }
+
     /// The I2C bus of a chip.
     pub(super) fn i2c(&mut self, section: &Section) -> Result<String, Trouble> {
         let mcu = section.text("i2c_mcu").unwrap_or(MAIN).to_owned();
