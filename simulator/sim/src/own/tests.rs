@@ -350,3 +350,32 @@ fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
     let room = |text: &str| of(text, "axis", "name", "x")["overtravel_mm"].as_float().unwrap();
     assert_eq!(room(&PRINTER.replace("[stepper_x]", "[stepper_x]\nhoming_speed: 150")), 6.0);
 }
+
+#[test]
+fn a_thermistor_reads_as_klippy_calculates_it() {
+    let of = |more: &str| {
+        let sensor = "[temperature_sensor own]\nsensor_pin: PA2\nmin_temp: 0\nmax_temp: 100\n";
+        let description = translated(&format!("{PRINTER}\n{sensor}{more}")).unwrap().description;
+        let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
+        let found: Vec<Table> =
+            heaters.filter(|heater| heater.get("name") == Some(&Value::from("own"))).cloned().collect();
+        found.into_iter().next().unwrap()
+    };
+    let rows = |table: &Table, key: &str| -> Vec<Vec<f64>> { table[key].clone().try_into().unwrap() };
+    // The resistor in series adds to the thermistor, also between its points.
+    let inline = of("sensor_type: Generic 3950\ninline_resistor: 1000\n");
+    let fraction_at = |celsius: f64| {
+        let found = rows(&inline, "points_celsius_fraction").into_iter().find(|point| point[0] == celsius);
+        found.unwrap()[1]
+    };
+    assert!((fraction_at(25.0) - 101_000.0 / 105_700.0).abs() < 1e-9);
+    assert!((fraction_at(150.0) - 2770.0 / 7470.0).abs() < 1e-9);
+    // By klippy's thermistor.py.
+    assert!((fraction_at(100.0) - 0.626_166_716_577).abs() < 1e-9, "{}", fraction_at(100.0));
+    // No curve leads through these points: klippy takes the beta between the first and the last.
+    let points = "temperature1: 25\nresistance1: 100000\ntemperature2: 100\nresistance2: 1000\n\
+                  temperature3: 200\nresistance3: 100\n";
+    let beta = of(&format!("sensor_type: mine\n[thermistor mine]\n{points}"));
+    assert_eq!(rows(&beta, "points_celsius_ohm"), [[25.0, 100_000.0]]);
+    assert!((beta["beta_k"].as_float().unwrap() - 5568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
+}
