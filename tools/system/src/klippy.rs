@@ -66,6 +66,12 @@ impl Klippy {
         Some(format!("sudo -u {} {} install numpy", word(&self.who.name), word(pip.display())))
     }
 
+    /// Its folder, if that lacks this module. `None` also if it cannot be read.
+    pub fn lacks(&self, module: &str) -> Option<PathBuf> {
+        let folder = self.folder.as_ref().filter(|folder| has_module(folder, "bus") && !has_module(folder, module));
+        folder.cloned()
+    }
+
     /// Its configuration, if the doctor can use it.
     pub fn printer(&self) -> Option<&Printer> {
         self.printer.as_ref()?.as_ref().ok()
@@ -80,6 +86,14 @@ impl Klippy {
     pub fn restart(&self) -> String {
         format!("sudo systemctl restart {}", word(self.unit.as_deref().unwrap_or("klipper")))
     }
+}
+
+/// Whether a folder of klippy.py has the module of a section with this first word.
+pub fn has_module(klippy: &Path, word: &str) -> bool {
+    ["extras", "plugins"].into_iter().any(|folder| {
+        let module = klippy.join(folder).join(word);
+        module.with_extension("py").exists() || module.join("__init__.py").exists()
+    })
 }
 
 /// Each klippy: the running ones that no stranger has started, and those whose units are enabled. If there is none: the

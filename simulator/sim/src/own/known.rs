@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use pinion_printer_config::{Config, Section};
+use pinion_system::klippy::has_module;
 
 /// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,11 +70,7 @@ const WITHOUT_MODULE: &[&str] = &[
 pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
     let Some(klipper) = klipper else { return kind_of(word) == Kind::Strange };
     let is_built_in = WITHOUT_MODULE.contains(&word) || word.starts_with("stepper_") || is_numbered(word, "extruder");
-    let has = |folder: &str| {
-        let module = klipper.join("klippy").join(folder).join(word);
-        module.with_extension("py").exists() || module.join("__init__.py").exists()
-    };
-    !is_built_in && !["extras", "plugins"].into_iter().any(has)
+    !is_built_in && !has_module(&klipper.join("klippy"), word)
 }
 
 /// klippy's sections that make the probe, beside `[probe]`.
