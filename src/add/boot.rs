@@ -181,9 +181,14 @@ fn changed(text: &str, key: &str, change: impl Fn(&str) -> String) -> Option<Str
     Some(text.split_inclusive('\n').enumerate().map(line).collect())
 }
 
-/// Sets a key to a value.
+/// Sets a key to a value. The spaces around the old value stay.
 fn set(text: &str, key: &str, value: &str) -> String {
-    let with = |line: &str| format!("{key}={value}{}", &line[line.trim_end_matches(['\r', '\n']).len()..]);
+    let with = |line: &str| {
+        let (head, old) = line.split_at(key.len() + 1);
+        let end = &old[old.trim_end().len()..];
+        let begin = &old[..old.len() - end.len() - old.trim().len()];
+        format!("{head}{begin}{value}{end}")
+    };
     changed(text, key, with).unwrap_or_else(|| ended(text) + &format!("{key}={value}{}", end_of(text)))
 }
 
@@ -307,6 +312,7 @@ mod tests {
             ("#overlays=a\n", "#overlays=a\noverlays=spidev1_1\n"),
             ("rootdev=1", "rootdev=1\noverlays=spidev1_1\n"),
             ("overlays=\n", "overlays=spidev1_1\n"),
+            ("overlays= a \t\nx=1\n", "overlays= a spidev1_1 \t\nx=1\n"),
         ] {
             assert_eq!(after(before).unwrap(), format!("{expected}{mark}"));
         }

@@ -22,6 +22,7 @@ use pinion_system::board::{self, Board, Kind, Slot};
 use pinion_system::complete::offering;
 use pinion_system::uses::{Resource, Source, Uses};
 
+mod beside;
 mod boot;
 mod catalog;
 mod check;
@@ -126,7 +127,7 @@ fn added(args: &AddArgs, computer: &Computer, board: Option<Board>, report: &mut
     let target = Target::find(computer, args.config.as_deref(), args.mcu.as_deref());
     let lacks = |device: &Device| {
         let klippy = target.as_ref().ok()?.klippy(computer)?;
-        printer::lacks(&klippy, device.module())
+        klippy.lacks(device.module())
     };
     let Some(name) = &args.device else {
         return list::list(&catalog, board.as_ref(), &model, &lacks, report);

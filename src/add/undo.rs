@@ -19,7 +19,7 @@ use super::moonraker::Moonraker;
 use super::plan::{I2C_DEV, MODULES};
 use super::printer::Target;
 use super::report::Report;
-use super::{AddArgs, ask, boot, command, make, moonraker_of, refuse_while_printing};
+use super::{AddArgs, ask, beside, boot, command, make, moonraker_of, refuse_while_printing};
 
 /// Takes a device back.
 pub(super) fn undo(
@@ -41,7 +41,7 @@ pub(super) fn undo(
             let editor = Editor::new(computer, Some(target.owner));
             target.files().for_each(|file| editor.sweep(&file));
             editor.sweep(&target.file(&device.file(name)));
-            own = target.plan_undo(&editor, catalog, device, name, &mut left)?;
+            own = beside::plan_undo(target, &editor, catalog, device, name, &mut left)?;
             host = Some((editor, target));
         }
         // Without its sections, nobody knows what is still needed.

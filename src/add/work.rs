@@ -12,7 +12,7 @@ use super::edit::Editor;
 use super::place::{Search, Wire};
 use super::printer::Target;
 use super::report::Report;
-use super::{AddArgs, command, make, moonraker_of, picture, refuse_while_printing};
+use super::{AddArgs, beside, command, make, moonraker_of, picture, refuse_while_printing};
 use pinion_system::Computer;
 use pinion_system::board::{Board, Slot};
 use pinion_system::files::Output;
@@ -196,7 +196,8 @@ impl Work<'_> {
             ));
         } else {
             let sections = self.sections(target, &mcu, wires, address)?;
-            let edits = target.plan(&editor, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
+            let edits =
+                beside::plan(target, &editor, self.device, self.name(), &sections, is_missing.then_some(&*mcu))?;
             is_changed = !edits.is_empty();
             make(self.args, moonraker, &editor, &edits, "Write this?", self.report)?;
         }
@@ -217,8 +218,7 @@ impl Work<'_> {
         self.report.line("Next:");
         next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
         if self.device.resonance
-            && let Some(remedy) =
-                target.klippy(self.computer).and_then(|klippy| crate::doctor::without_numpy(self.computer, &klippy))
+            && let Some(remedy) = target.klippy(self.computer).and_then(|klippy| klippy.without_numpy(self.computer))
         {
             self.report.line(format_args!("SHAPER_CALIBRATE needs numpy first: {remedy}"));
         }

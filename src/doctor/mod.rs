@@ -41,8 +41,6 @@ mod service;
 mod terminal;
 mod uses;
 
-pub(super) use uses::without_numpy;
-
 /// How to get the package.
 const INSTALL: &str = "sudo apt install pinion-mcu, from the repository that docs/guide/install.md sets up (or in a folder with Pinion's sources: sudo make install)";
 /// How to install its files again.

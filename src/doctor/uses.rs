@@ -3,9 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
 
-use pinion_linux::foreign::word;
 use pinion_system::Computer;
 use pinion_system::board::{append, is_pi};
 use pinion_system::finding::Finding;
@@ -121,28 +119,7 @@ pub(super) fn numpy(computer: &Computer, klippys: &[Klippy]) -> Vec<Finding> {
     let tested = klippys.iter().filter(|klippy| klippy.printer().is_some_and(has_tester));
     let finding = |klippy: &Klippy| {
         let found = format!("SHAPER_CALIBRATE fails: klippy's Python has no numpy ({})", klippy.found_by);
-        Some(Finding::warning(CHECK, found, without_numpy(computer, klippy)?))
+        Some(Finding::warning(CHECK, found, klippy.without_numpy(computer)?))
     };
     tested.filter_map(finding).collect()
-}
-
-/// The command that installs numpy for a klippy that has none. `None` also if that is not known.
-pub(crate) fn without_numpy(computer: &Computer, klippy: &Klippy) -> Option<String> {
-    let python = klippy.python.as_deref().filter(|python| computer.exists(python))?;
-    // A virtual environment has its packages beside its Python. It may also use the system's.
-    let home = python.parent()?.parent()?;
-    let settings = computer.text(home.join("pyvenv.cfg"))?;
-    let has = |home: &Path| {
-        let folders =
-            ["lib/python3*/site-packages/numpy", "lib/python3*/dist-packages/numpy", "lib/python3/dist-packages/numpy"];
-        folders
-            .iter()
-            .any(|folder| computer.matching(home.join(folder)).iter().any(|path| computer.exists(computer.name(path))))
-    };
-    let is_system_s = settings.lines().any(|line| line.replace(' ', "") == "include-system-site-packages=true");
-    if has(home) || is_system_s && [Path::new("/usr"), Path::new("/usr/local")].into_iter().any(has) {
-        return None;
-    }
-    let pip: PathBuf = home.join("bin/pip");
-    Some(format!("sudo -u {} {} install numpy", word(&klippy.who.name), word(pip.display())))
 }

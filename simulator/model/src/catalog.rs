@@ -9,10 +9,27 @@ use super::part::{
     pwm_channel, servo, spi_dac, spool, ssd1306, thermocouple, tmc2209, tmc2660, tmc5160, ws2812,
 };
 
-/// A part in the description: a `[[part]]`. Its key `kind` selects one of these.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase")]
-pub enum PartConfig {
+macro_rules! parts {
+    ($($(#[$about:meta])* $kind:ident($config:ty),)+) => {
+        /// A part in the description: a `[[part]]`. Its key `kind` selects one of these.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(tag = "kind", rename_all = "lowercase")]
+        pub enum PartConfig {
+            $($(#[$about])* $kind($config),)+
+        }
+
+        impl PartConfig {
+            /// The common interface of all parts.
+            pub(crate) fn part(&self) -> &dyn Part {
+                match self {
+                    $(PartConfig::$kind(config) => config,)+
+                }
+            }
+        }
+    };
+}
+
+parts! {
     /// An accelerometer.
     #[serde(alias = "adxl345")]
     Accelerometer(accelerometer::AccelerometerConfig),
@@ -72,38 +89,4 @@ pub enum PartConfig {
     Ads1220(ads1220::Ads1220Config),
     /// A coil over the bed.
     Ldc1612(ldc1612::Ldc1612Config),
-}
-
-impl PartConfig {
-    /// The common interface of all parts.
-    pub(crate) fn part(&self) -> &dyn Part {
-        match self {
-            PartConfig::Accelerometer(config) => config,
-            PartConfig::Ds18b20(config) => config,
-            PartConfig::PwmChannel(config) => config,
-            PartConfig::Loopback(config) => config,
-            PartConfig::Servo(config) => config,
-            PartConfig::Spool(config) => config,
-            PartConfig::Angle(config) => config,
-            PartConfig::Tmc2209(config) => config,
-            PartConfig::Tmc2660(config) => config,
-            PartConfig::I2cSensor(config) => config,
-            PartConfig::I2cRegister(config) => config,
-            PartConfig::SpiDac(config) => config,
-            PartConfig::Tmc2208(config) => config,
-            PartConfig::Tmc2130(config) => config,
-            PartConfig::Tmc2240(config) => config,
-            PartConfig::Tmc2240Uart(config) => config,
-            PartConfig::Tmc5160(config) => config,
-            PartConfig::Ws2812(config) => config,
-            PartConfig::Apa102(config) => config,
-            PartConfig::Ssd1306(config) => config,
-            PartConfig::Thermocouple(config) => config,
-            PartConfig::Probe(config) => config,
-            PartConfig::Bltouch(config) => config,
-            PartConfig::Hx71x(config) => config,
-            PartConfig::Ads1220(config) => config,
-            PartConfig::Ldc1612(config) => config,
-        }
-    }
 }

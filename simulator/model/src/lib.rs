@@ -30,7 +30,7 @@ pub use description::heater::{FanConfig, HeaterConfig};
 pub use description::kinematics::{DeltesianConfig, KinematicsConfig, NoKeys, RotaryDeltaConfig, WinchConfig};
 pub use description::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};
 pub use description::pin::PinName;
-pub use description::thermistor::Thermistor;
+pub use description::thermistor::{NoThermistor, Thermistor};
 pub use engine::bed::{BedShape, Space};
 pub use engine::look::{Colour, Look};
 pub use engine::pace::{Pace, PaceWatch};

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use super::engine::bed::{Bed, Space};
 use super::engine::look::Look;
-use super::engine::motion::Rail;
 use super::engine::pace::PaceWatch;
+use super::engine::rail::Rail;
 use super::engine::recorder::Recorder;
 use super::engine::ring::RingWatch;
 use super::engine::spi::SpiBus;

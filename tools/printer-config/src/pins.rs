@@ -9,6 +9,11 @@ use crate::{Config, Trouble};
 /// The name of the main MCU.
 pub const MAIN: &str = "mcu";
 
+/// The section of an MCU.
+pub fn section_of(mcu: &str) -> String {
+    if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") }
+}
+
 /// A pin in an option.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Pin {

@@ -42,6 +42,36 @@ pub struct Klippy {
 }
 
 impl Klippy {
+    /// The command that installs numpy for a klippy that has none. `None` also if that is not known.
+    pub fn without_numpy(&self, computer: &Computer) -> Option<String> {
+        let python = self.python.as_deref().filter(|python| computer.exists(python))?;
+        // A virtual environment has its packages beside its Python. It may also use the system's.
+        let home = python.parent()?.parent()?;
+        let settings = computer.text(home.join("pyvenv.cfg"))?;
+        let has = |home: &Path| {
+            let folders = [
+                "lib/python3*/site-packages/numpy",
+                "lib/python3*/dist-packages/numpy",
+                "lib/python3/dist-packages/numpy",
+            ];
+            folders.iter().any(|folder| {
+                computer.matching(home.join(folder)).iter().any(|path| computer.exists(computer.name(path)))
+            })
+        };
+        let is_system_s = settings.lines().any(|line| line.replace(' ', "") == "include-system-site-packages=true");
+        if has(home) || is_system_s && [Path::new("/usr"), Path::new("/usr/local")].into_iter().any(has) {
+            return None;
+        }
+        let pip: PathBuf = home.join("bin/pip");
+        Some(format!("sudo -u {} {} install numpy", word(&self.who.name), word(pip.display())))
+    }
+
+    /// Its folder, if that lacks this module. `None` also if it cannot be read.
+    pub fn lacks(&self, module: &str) -> Option<PathBuf> {
+        let folder = self.folder.as_ref().filter(|folder| has_module(folder, "bus") && !has_module(folder, module));
+        folder.cloned()
+    }
+
     /// Its configuration, if the doctor can use it.
     pub fn printer(&self) -> Option<&Printer> {
         self.printer.as_ref()?.as_ref().ok()
@@ -56,6 +86,14 @@ impl Klippy {
     pub fn restart(&self) -> String {
         format!("sudo systemctl restart {}", word(self.unit.as_deref().unwrap_or("klipper")))
     }
+}
+
+/// Whether a folder of klippy.py has the module of a section with this first word.
+pub fn has_module(klippy: &Path, word: &str) -> bool {
+    ["extras", "plugins"].into_iter().any(|folder| {
+        let module = klippy.join(folder).join(word);
+        module.with_extension("py").exists() || module.join("__init__.py").exists()
+    })
 }
 
 /// Each klippy: the running ones that no stranger has started, and those whose units are enabled. If there is none: the

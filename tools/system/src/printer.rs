@@ -7,7 +7,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use pinion_printer_config::pins::{Aliases, Pin};
+use pinion_printer_config::pins::{Aliases, Pin, section_of};
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::HOST_PATHS;
 
@@ -96,8 +96,7 @@ impl Printer {
 
     /// The `serial` of an MCU. The main one is called `mcu`.
     pub fn serial(&self, mcu: &str) -> Option<&Path> {
-        let name = if mcu == "mcu" { mcu.to_owned() } else { format!("mcu {mcu}") };
-        self.config.section(&name)?.text("serial").map(Path::new)
+        self.config.section(&section_of(mcu))?.text("serial").map(Path::new)
     }
 
     /// The `serial` of each MCU.

@@ -25,7 +25,7 @@ pub struct Thermistor {
 
 /// Why points and a beta do not describe a thermistor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum NoThermistor {
+pub enum NoThermistor {
     /// A point is at or below 0 K or 0 ohm, or not a finite number.
     PointOutOfRange,
     /// The beta is at or below 0 K, or not a finite number.
@@ -45,7 +45,11 @@ impl Thermistor {
     ///
     /// `points_celsius_ohm` are pairs of a temperature in °C and a resistance in ohm; `beta_k` is in
     /// kelvin.
-    pub(crate) fn new(
+    ///
+    /// # Errors
+    ///
+    /// No thermistor has these values.
+    pub fn new(
         points_celsius_ohm: &[(f64, f64)],
         beta_k: Option<f64>,
         pullup_ohm: f64,
@@ -83,18 +87,26 @@ impl Thermistor {
         }
     }
 
-    /// The voltage at the ADC as a fraction of its reference.
-    pub(crate) fn fraction(&self, celsius: f64) -> f64 {
+    fn ln_ohm(&self, celsius: f64) -> f64 {
         let inverse = 1.0 / (celsius + KELVIN);
-        let ln_ohm = if self.c3 > 0.0 {
+        if self.c3 > 0.0 {
             let y = (self.c1 - inverse) / (2.0 * self.c3);
             let x = ((self.c2 / (3.0 * self.c3)).powi(3) + y * y).sqrt();
             (x - y).cbrt() - (x + y).cbrt()
         } else {
             (inverse - self.c1) / self.c2
-        };
+        }
+    }
+
+    /// Its resistance.
+    pub fn ohm(&self, celsius: f64) -> f64 {
+        self.ln_ohm(celsius).exp()
+    }
+
+    /// The voltage at the ADC as a fraction of its reference.
+    pub(crate) fn fraction(&self, celsius: f64) -> f64 {
         // The logistic function of ln(R / pull-up): R / (pull-up + R) without an overflow.
-        1.0 / (1.0 + (self.pullup_ohm.ln() - ln_ohm).exp())
+        1.0 / (1.0 + (self.pullup_ohm.ln() - self.ln_ohm(celsius)).exp())
     }
 
     /// The temperature in °C at which the ADC reads this fraction of its reference.

@@ -3,7 +3,8 @@
 
 use std::sync::Arc;
 
-use super::motion::{Axis, Motor, Rail};
+use super::motion::Axis;
+use super::rail::{Motor, Rail};
 use crate::description::axes::AxisConfig;
 use crate::description::check::Trouble;
 use crate::description::printer::Printer;

@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use super::linkage::{Linkage, RAILS_MAX};
-use super::motion::Rail;
+use super::rail::Rail;
 use crate::description::axes::BedConfig;
 
 /// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.

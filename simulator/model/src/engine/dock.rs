@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::motion::Rail;
+use super::rail::Rail;
 
 /// How near the head has to come.
 const NEAR_MM: f64 = 0.6;

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::motion::{Motor, Rail};
+use super::rail::{Motor, Rail};
 use super::track::{KEPT, Recorded};
 use pinion_firmware::time::Clock;
 

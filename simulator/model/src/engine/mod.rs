@@ -14,6 +14,7 @@ pub(crate) mod motion;
 pub(crate) mod noise;
 pub(crate) mod pace;
 pub(crate) mod physics;
+pub(crate) mod rail;
 pub(crate) mod recorder;
 pub(crate) mod register_map;
 pub(crate) mod ring;

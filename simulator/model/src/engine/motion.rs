@@ -1,132 +1,22 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Everything that the pins move: motors, and the rails that they move.
+//! What the pins of a stepper driver move.
 //!
 //! The core of a board drives the pins of its motors. Any thread may read. Nothing here locks, blocks or allocates.
-//!
-//! A rail is what has an endstop and two ends: the carriage of an axis, the tower of a delta, an arm that turns. Most
-//! motors move one rail. On CoreXY each of two motors moves two of them. A rail keeps no place of its own: its place
-//! follows from its motors, so that motors of several boards may move it.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use super::dock::Dock;
+use super::rail::{Motor, Rail};
 use super::seqlock::Seqlock;
-use super::track::Track;
-use crate::description::axes::{AxisConfig, End};
+use crate::description::axes::AxisConfig;
+#[cfg(test)]
 use crate::description::rails::RailConfig;
 use pinion_firmware::time::Clock;
-
-/// Places are compared in these units: a picometer, or as small a part of a radian. Sums of fractions would miss the
-/// place of an endstop by their rounding.
-const PER_MM: f64 = 1e9;
 
 /// How far two motors of one rail may be apart. The rail then jams, and a motor that goes on loses its steps. Homing
 /// stops motors of two boards up to 25 ms apart.
 const RACKED_MM: f64 = 3.0;
-
-/// The rotor of a motor, and its last steps.
-#[derive(Debug)]
-pub struct Motor {
-    position: AtomicI64,
-    track: Track,
-}
-
-impl Motor {
-    /// The limits of the description keep the position below 2^63.
-    pub fn at(start_mm: f64, config: &AxisConfig) -> Arc<Motor> {
-        let position = AtomicI64::new((start_mm * config.steps_per_mm).round() as i64);
-        Arc::new(Motor { position, track: Track::new() })
-    }
-
-    /// Its place in steps.
-    pub fn steps(&self) -> i64 {
-        self.position.load(Ordering::Relaxed)
-    }
-
-    /// Its last steps with their instants.
-    pub fn track(&self) -> &Track {
-        &self.track
-    }
-}
-
-/// A part that motors move between two ends.
-#[derive(Debug)]
-pub struct Rail {
-    pub name: String,
-    /// Its lowest and its highest place, in mm or radians; `None` for a rail without an end.
-    pub travel_mm: Option<(f64, f64)>,
-    /// Its motors, each with the way of the rail in one of its steps.
-    motors: Vec<(Arc<Motor>, f64)>,
-    /// The lowest and the highest place that it reaches without hitting something.
-    hard_limits: Option<(i64, i64)>,
-    /// The endstop's end, and the place where it closes.
-    endstop: Option<(End, i64)>,
-}
-
-impl Rail {
-    pub fn new(config: &RailConfig, motors: Vec<(Arc<Motor>, f64)>) -> Rail {
-        let travel_mm = config.travel_mm;
-        Rail {
-            name: config.name.to_owned(),
-            travel_mm,
-            motors,
-            hard_limits: travel_mm.map(|(min_mm, max_mm)| {
-                let over_mm = config.overtravel_mm;
-                (units(min_mm - over_mm), units(max_mm + over_mm))
-            }),
-            endstop: config.endstop.map(|(end, mm)| (end, units(mm))),
-        }
-    }
-
-    /// Its motors, each with the way of the rail in one of its steps.
-    pub(crate) fn motors(&self) -> &[(Arc<Motor>, f64)] {
-        &self.motors
-    }
-
-    fn units(&self) -> i64 {
-        self.units_at(Motor::steps)
-    }
-
-    fn units_at(&self, steps: impl Fn(&Motor) -> i64) -> i64 {
-        units(self.motors.iter().map(|(motor, mm)| steps(motor) as f64 * mm).sum())
-    }
-
-    /// Its place while its motors are at these steps.
-    pub fn mm_at(&self, steps: impl Fn(&Motor) -> i64) -> f64 {
-        self.units_at(steps) as f64 / PER_MM
-    }
-
-    /// Its place.
-    pub fn position_mm(&self) -> f64 {
-        self.mm_at(Motor::steps)
-    }
-
-    /// The greatest way of a step.
-    pub fn step_mm(&self) -> f64 {
-        self.motors.iter().map(|(_, mm)| mm.abs()).fold(0.0, f64::max)
-    }
-
-    /// Whether the rail can move by this way. A rail beyond its end can come back.
-    fn moves_by(&self, mm: f64) -> bool {
-        let to = self.units() + units(mm);
-        self.hard_limits.is_none_or(|(min, max)| if mm < 0.0 { to >= min } else { to <= max })
-    }
-
-    /// Whether the endstop is closed; `None` without an endstop.
-    pub fn endstop(&self) -> Option<bool> {
-        let position = self.units();
-        self.endstop.map(|(end, at)| match end {
-            End::Min => position <= at,
-            End::Max => position >= at,
-        })
-    }
-}
-
-/// The limits of the description keep it below 2^63.
-fn units(mm: f64) -> i64 {
-    (mm * PER_MM).round() as i64
-}
 
 /// A stepper motor with its driver, and the rail of its name.
 #[derive(Debug)]
@@ -256,9 +146,7 @@ impl Axis {
             self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
             return false;
         }
-        let position = self.motor.steps().wrapping_add(way);
-        self.motor.position.store(position, Ordering::Relaxed);
-        self.motor.track.push(at, position);
+        self.motor.turn(way, at);
         if let Some(dock) = self.dock.get() {
             dock.passed();
         }

@@ -8,7 +8,8 @@ use std::sync::Arc;
 
 use super::bed::Bed;
 use super::follower::Followers;
-use super::motion::{Axis, Rail};
+use super::motion::Axis;
+use super::rail::Rail;
 use pinion_firmware::time::{Clock, Ticks};
 
 /// Highest number of points that a recorder keeps: 235 MB. A print of ten hours has about half of them.

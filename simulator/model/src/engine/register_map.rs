@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Chips with registers: a map of their registers, and messages of a register's address and data bytes on SPI and I2C.
 
-use std::ops::{BitAnd, BitOr, Not};
+use std::ops::{BitAnd, BitOr, Not, Range};
 
 use super::i2c::I2cChip;
 use super::spi::SpiChip;
@@ -38,10 +38,10 @@ impl<V: Copy + Default + PartialEq + BitAnd<Output = V> + BitOr<Output = V> + No
         map
     }
 
-    /// A chip of which this many addresses hold what a host writes. The registers of the table differ.
-    pub(crate) fn holding(addresses: usize, table: &[Register<V>]) -> RegisterMap<V> {
-        let plain = (Access::ReadWrite, !V::default(), V::default());
-        let mut map = RegisterMap { registers: vec![Some(plain); addresses] };
+    /// Registers that hold what a host writes, at these addresses. The registers of the table differ.
+    pub(crate) fn holding(addresses: Range<usize>, table: &[Register<V>]) -> RegisterMap<V> {
+        let mut map = RegisterMap { registers: vec![None; addresses.end] };
+        map.registers[addresses].fill(Some((Access::ReadWrite, !V::default(), V::default())));
         map.add(table);
         map
     }
@@ -133,40 +133,44 @@ pub(crate) trait RegisterChip: Send {
 /// The first byte on SPI: the host reads.
 const READ: u8 = 0x80;
 
-/// The state of a message.
-#[derive(Clone, Copy, PartialEq)]
-enum Message {
-    /// Waits for the first byte.
-    Start,
-    Read(u8),
-    Write(u8),
+/// The meaning of a message's next byte.
+enum Next {
+    /// It names a register.
+    Register,
+    Read,
+    Write,
 }
 
 /// A chip with registers behind its bus.
 pub(crate) struct OnBus<C> {
     pub(crate) chip: C,
-    message: Message,
-    many: bool,
+    next: Next,
+    /// The register of the next data byte.
+    register: u8,
+    /// Whether the data bytes are those of registers in a row.
+    in_a_row: bool,
 }
 
 impl<C: RegisterChip> OnBus<C> {
     pub(crate) fn new(chip: C) -> OnBus<C> {
-        OnBus { chip, message: Message::Read(0), many: true }
+        OnBus { chip, next: Next::Register, register: 0, in_a_row: true }
     }
 
-    fn next(&mut self, register: u8) -> u8 {
-        if self.many { self.chip.next(register) } else { register }
-    }
-
-    fn get(&mut self, register: u8) -> u8 {
-        let value = self.chip.read(register);
-        self.message = Message::Read(self.next(register));
+    fn get(&mut self) -> u8 {
+        let value = self.chip.read(self.register);
+        self.go_on();
         value
     }
 
-    fn set(&mut self, register: u8, value: u8) {
-        self.chip.write(register, value);
-        self.message = Message::Write(self.next(register));
+    fn set(&mut self, value: u8) {
+        self.chip.write(self.register, value);
+        self.go_on();
+    }
+
+    fn go_on(&mut self) {
+        if self.in_a_row {
+            self.register = self.chip.next(self.register);
+        }
     }
 }
 
@@ -177,20 +181,19 @@ impl<C: RegisterChip> SpiChip for OnBus<C> {
 
     fn select(&mut self, _rate_hz: u32) {
         self.chip.begin();
-        self.message = Message::Start;
+        self.next = Next::Register;
     }
 
     fn exchange(&mut self, byte: u8) -> u8 {
-        match self.message {
-            Message::Start => {
-                let register;
-                (register, self.many) = self.chip.register(byte & !READ, true);
-                self.message = if byte & READ == 0 { Message::Write(register) } else { Message::Read(register) };
+        match self.next {
+            Next::Register => {
+                (self.register, self.in_a_row) = self.chip.register(byte & !READ, true);
+                self.next = if byte & READ == 0 { Next::Write } else { Next::Read };
                 0
             }
-            Message::Read(register) => self.get(register),
-            Message::Write(register) => {
-                self.set(register, byte);
+            Next::Read => self.get(),
+            Next::Write => {
+                self.set(byte);
                 0
             }
         }
@@ -204,31 +207,23 @@ impl<C: RegisterChip> SpiChip for OnBus<C> {
 impl<C: RegisterChip> I2cChip for OnBus<C> {
     fn start(&mut self, read: bool) -> bool {
         self.chip.begin();
-        // A read goes on at the register that was written before.
-        self.message = match self.message {
-            Message::Read(register) | Message::Write(register) if read => Message::Read(register),
-            _ => Message::Start,
-        };
+        // A read goes on at the register that was named last.
+        self.next = if read { Next::Read } else { Next::Register };
         true
     }
 
     fn write(&mut self, byte: u8) -> bool {
-        match self.message {
-            Message::Write(register) => self.set(register, byte),
-            _ => {
-                let register;
-                (register, self.many) = self.chip.register(byte, false);
-                self.message = Message::Write(register);
-            }
+        if let Next::Write = self.next {
+            self.set(byte);
+        } else {
+            (self.register, self.in_a_row) = self.chip.register(byte, false);
+            self.next = Next::Write;
         }
         true
     }
 
     fn read(&mut self) -> u8 {
-        match self.message {
-            Message::Read(register) => self.get(register),
-            _ => 0xff,
-        }
+        self.get()
     }
 
     fn stop(&mut self) {
@@ -267,10 +262,31 @@ mod tests {
             map.set(address, 0xff);
             assert_eq!(map.get(address), if address < 5 { 0xff } else { 0 }, "the chip writes all bits");
         }
-        let mut map = RegisterMap::holding(7, TABLE);
-        map.write(6, 0xf3);
-        map.write(7, 0xf3);
-        map.write(0, 0xf3);
-        assert_eq!([map.read(6), map.read(7), map.read(0)], [0xf3, 0, 0x5a]);
+        let mut map = RegisterMap::holding(6..7, TABLE);
+        (0..8).for_each(|address| map.write(address, 0xf3));
+        assert_eq!([0, 5, 6, 7].map(|address| map.read(address)), [0x5a, 0, 0xf3, 0]);
+    }
+
+    /// A chip of nothing but its registers.
+    impl RegisterChip for RegisterMap<u8> {
+        fn read(&mut self, register: u8) -> u8 {
+            RegisterMap::read(self, register)
+        }
+
+        fn write(&mut self, register: u8, value: u8) {
+            RegisterMap::write(self, register, value);
+        }
+    }
+
+    #[test]
+    fn a_message_without_a_byte_leaves_the_named_register() {
+        let mut chip = OnBus::new(RegisterMap::holding(0..0x80, &[]));
+        for bytes in [&[0x10, 1, 2, 3][..], &[0x10], &[]] {
+            assert!(chip.start(false) && bytes.iter().all(|byte| I2cChip::write(&mut chip, *byte)));
+            chip.stop();
+        }
+        assert!(chip.start(true));
+        assert_eq!([(); 3].map(|()| I2cChip::read(&mut chip)), [1, 2, 3]);
+        chip.stop();
     }
 }

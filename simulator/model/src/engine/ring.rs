@@ -7,7 +7,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::follower::RailFollower;
-use super::motion::Rail;
+use super::rail::Rail;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks};
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

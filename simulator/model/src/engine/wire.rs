@@ -4,8 +4,9 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::motion::{Axis, Rail};
+use super::motion::Axis;
 use super::physics::{Fan, Heater, Lamp, Switch};
+use super::rail::Rail;
 use super::time::{PrinterTime, seconds};
 use crate::description::pin::{PinName, on_board};
 use crate::description::sensor::Sensor;

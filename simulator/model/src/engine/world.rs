@@ -4,8 +4,9 @@
 use std::sync::Arc;
 
 use super::look::Look;
-use super::motion::{Axis, Rail};
+use super::motion::Axis;
 use super::physics::{Fan, Heater, Lamp};
+use super::rail::Rail;
 use super::ring::RingConfig;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::Clock;

@@ -168,7 +168,8 @@ mod tests {
         assert_eq!(transfer(&mut chip, &[0x32, 0]), [0, 0]);
         // Half a turn and 10.24 of 32768.
         assert_eq!(transfer(&mut chip, &[0x20, 0]), (0x4000u16 + 10).to_be_bytes());
-        assert_eq!(transfer(&mut chip, &[0x00, 0]), 0x1801u16.to_be_bytes(), "odd parity");
+        assert_eq!(transfer(&mut chip, &[0x00, 0x20, 0]), [0x18, 0x01, 0x00], "odd parity");
+        assert_eq!(transfer(&mut chip, &[0x20, 0]), 0x1801u16.to_be_bytes(), "a frame of 24 bits names no register");
         assert!(!chip.knows_mode(0));
     }
 

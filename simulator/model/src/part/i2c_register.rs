@@ -62,7 +62,7 @@ struct Chip {
 
 impl Chip {
     fn on_bus(chip: I2cRegisterChip) -> OnBus<Chip> {
-        OnBus::new(Chip { chip, registers: RegisterMap::holding(256, &[]) })
+        OnBus::new(Chip { chip, registers: RegisterMap::holding(0..0x100, &[]) })
     }
 }
 

@@ -232,7 +232,7 @@ impl Ldc1612 {
     fn new(coil: Coil, intb: Arc<ReadyLine>, clock: Arc<dyn TimeSource>) -> Ldc1612 {
         let (conversions, registers) = (Conversions::NONE, RegisterMap::new(REGISTERS));
         let mut chip = Ldc1612 { coil, clock, intb, conversions, read: 0, registers, lsb: 0, word: 0 };
-        chip.begin();
+        chip.start_over();
         chip
     }
 
@@ -243,7 +243,7 @@ impl Ldc1612 {
     }
 
     /// Conversions start again, or stop.
-    fn begin(&mut self) {
+    fn start_over(&mut self) {
         let ticks = |clocks: f64| clocks / self.reference_hz() * f64::from(CLOCK_FREQ);
         let conversion = ticks(16.0 * f64::from(self.registers.get(RCOUNT0)) + 4.0);
         let settling = ticks(16.0 * f64::from(self.registers.get(SETTLECOUNT0)));
@@ -324,10 +324,10 @@ impl Ldc1612 {
         self.registers.write(address, value);
         if self.registers.is_set(RESET_DEV, RESET_DEV_BIT) {
             self.registers = RegisterMap::new(REGISTERS);
-            self.begin();
+            self.start_over();
         }
         if [RCOUNT0, SETTLECOUNT0, CLOCK_DIVIDERS0, ERROR_CONFIG, CONFIG].contains(&address) {
-            self.begin();
+            self.start_over();
         }
     }
 }

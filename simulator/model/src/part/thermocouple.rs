@@ -122,7 +122,7 @@ impl Part for ThermocoupleConfig {
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
-            let cause = format!("the answer of a {} to it is unknown", self.chip.name());
+            let cause = format!("a {} has no known answer to this fault", self.chip.name());
             return wrong(whose, "fault", &cause, "choose `open` or `shorted`");
         }
         check(whose, "chip_celsius", self.chip_celsius, Bound::Any)?;

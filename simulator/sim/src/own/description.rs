@@ -10,6 +10,11 @@ use toml::{Table, Value};
 pub(super) struct Entry(pub(super) Table);
 
 impl Entry {
+    /// A part of this kind.
+    pub(super) fn of_kind(kind: &str) -> Entry {
+        Entry::default().set("kind", kind)
+    }
+
     pub(super) fn set(mut self, key: &str, value: impl Into<Value>) -> Entry {
         self.0.insert(key.to_owned(), value.into());
         self

@@ -6,7 +6,7 @@ use pinion_printer_config::{Limit, Section, Trouble};
 use super::description::Entry;
 use super::known::is_left_over;
 use super::plugins::{PIN, StandIn};
-use super::translate::Translator;
+use super::translator::Translator;
 
 /// How high a coil is above the nozzle's tip.
 const COIL_MM: f64 = 2.5;
@@ -62,11 +62,9 @@ impl Translator<'_> {
     /// The plain probe in the place of a plugin's.
     fn stand_in(&mut self) {
         let Some(StandIn { section, offsets_mm }) = self.left_out.stand_in.clone() else { return };
-        let mut part = Entry::default().set("kind", "probe").set("pin", PIN);
-        for (axis, mm) in ["x", "y", "z"].iter().zip(offsets_mm) {
-            part = part.set(&format!("{axis}_offset_mm"), mm);
-        }
-        self.out.add("part", part);
+        let part = Entry::of_kind("probe").set("pin", PIN);
+        let offsets = ["x", "y", "z"].iter().zip(offsets_mm);
+        self.out.add("part", offsets.fold(part, |part, (axis, mm)| part.set(&format!("{axis}_offset_mm"), mm)));
         if let Some(section) = self.config.section(&section) {
             self.note(section, "is left out", "a plain [probe] at its offsets takes its place");
         }
@@ -104,15 +102,12 @@ impl Translator<'_> {
         self.out.name(kind, &wanted)
     }
 
-    /// A probe's offsets from the nozzle.
-    fn offsets(part: Entry, section: &Section) -> Result<Entry, Trouble> {
-        let mut part = part;
-        for axis in ["x", "y", "z"] {
-            let key = format!("{axis}_offset");
-            let mm = section.number(&key, Limit::Any)?.unwrap_or(0.0);
-            part = part.set(&format!("{axis}_offset_mm"), mm);
-        }
-        Ok(part)
+    /// A probe's offsets from the nozzle along these axes.
+    fn offsets(part: Entry, section: &Section, axes: &[&str]) -> Result<Entry, Trouble> {
+        axes.iter().try_fold(part, |part, axis| {
+            let mm = section.number(&format!("{axis}_offset"), Limit::Any)?.unwrap_or(0.0);
+            Ok(part.set(&format!("{axis}_offset_mm"), mm))
+        })
     }
 
     fn probe(&mut self, section: &Section) -> Result<(), Trouble> {
@@ -120,7 +115,7 @@ impl Translator<'_> {
             section.required("z_offset")?;
         }
         let Some(pin) = self.take(section, "pin")? else { return section.required("pin").map(drop) };
-        let mut part = Translator::offsets(Entry::default().set("kind", "probe").set("pin", pin), section)?;
+        let mut part = Translator::offsets(Entry::of_kind("probe").set("pin", pin), section, &["x", "y", "z"])?;
         if let Some(dock_mm) = self.dock_mm(section) {
             part = part.numbers("dock_mm", dock_mm);
         }
@@ -151,23 +146,15 @@ impl Translator<'_> {
         let (Some(sensor), Some(control)) = (sensor?, control?) else {
             return section.required("sensor_pin").and(section.required("control_pin")).map(drop);
         };
-        let part = Entry::default().set("kind", "bltouch").set("sensor_pin", sensor).set("control_pin", control);
-        self.out.add("part", Translator::offsets(part, section)?);
+        let part = Entry::of_kind("bltouch").set("sensor_pin", sensor).set("control_pin", control);
+        self.out.add("part", Translator::offsets(part, section, &["x", "y", "z"])?);
         Ok(())
     }
 
     fn eddy(&mut self, section: &Section) -> Result<(), Trouble> {
-        let bus = self.i2c(section)?;
-        let address = section.whole("i2c_address", 0)?.unwrap_or(42);
-        if !self.out.is_new_chip(&bus, address) {
-            return Ok(());
-        }
-        let mut part = Entry::default().set("kind", "ldc1612").set("bus", bus).set("address", address);
-        for axis in ["x", "y"] {
-            let mm = section.number(&format!("{axis}_offset"), Limit::Any)?.unwrap_or(0.0);
-            part = part.set(&format!("{axis}_offset_mm"), mm);
-        }
-        part = part.set_if("intb_pin", self.take(section, "intb_pin")?);
+        let Some(part) = self.chip_on_i2c(section, 42, "ldc1612")? else { return Ok(()) };
+        let part = Translator::offsets(part, section, &["x", "y"])?;
+        let part = part.set_if("intb_pin", self.take(section, "intb_pin")?);
         let Curve { far_hz, near_hz, fade_mm } =
             section.text("calibrate").and_then(Curve::through).unwrap_or(Curve::USUAL);
         let part = part.set("coil_mm", COIL_MM).set("far_hz", far_hz).set("near_hz", near_hz).set("fade_mm", fade_mm);
@@ -187,7 +174,7 @@ impl Translator<'_> {
                 let [dout, sclk] = ["dout_pin", "sclk_pin"].map(|key| self.take(section, key));
                 let (Some(dout), Some(sclk)) = (dout?, sclk?) else { return Ok(()) };
                 let rate = section.whole("sample_rate", 1)?.unwrap_or(if chip == "hx711" { 80 } else { 320 });
-                let part = Entry::default().set("kind", "hx71x").set("chip", chip).set("dout_pin", dout);
+                let part = Entry::of_kind("hx71x").set("chip", chip).set("dout_pin", dout);
                 part.set("sclk_pin", sclk).set("samples_per_s", rate)
             }
             "ads1220" => {
@@ -196,12 +183,11 @@ impl Translator<'_> {
                     self.note(section, "is the second one with an ADS1220", "only the first one is simulated");
                     return Ok(());
                 }
-                let (Some((bus, select)), Some(ready)) =
-                    (self.spi(section, "cs_pin")?, self.take(section, "data_ready_pin")?)
+                let (Some(part), Some(ready)) =
+                    (self.chip_on_spi(section, "cs_pin", "ads1220")?, self.take(section, "data_ready_pin")?)
                 else {
                     return Ok(());
                 };
-                let part = Entry::default().set("kind", "ads1220").set("bus", bus).set_if("select_pin", select);
                 part.set("drdy_pin", ready)
             }
             chip => {
@@ -225,7 +211,7 @@ impl Translator<'_> {
         let Some(pin) = self.take(section, "switch_pin")? else { return Ok(()) };
         let length = section.number("detection_length", Limit::Above(0.0))?.unwrap_or(7.0);
         let name = self.name_of("part", section);
-        let part = Entry::default().set("kind", "spool").set("name", name).set("axis", axis);
+        let part = Entry::of_kind("spool").set("name", name).set("axis", axis);
         let part = part.set("length_mm", 330_000.0).set("encoder_pin", pin).set("encoder_mm", length / 4.0);
         self.out.add("part", part);
         Ok(())
@@ -246,7 +232,7 @@ impl Translator<'_> {
             section.number(key, Limit::Above(0.0)).map(|seconds| seconds.map_or(default, |seconds| seconds * 1e6))
         };
         let name = self.name_of("part", section);
-        let part = Entry::default().set("kind", "servo").set("name", name).set("pin", pin);
+        let part = Entry::of_kind("servo").set("name", name).set("pin", pin);
         let part = part.set("min_pulse_us", us("minimum_pulse_width", 1000.0)?);
         let part = part.set("max_pulse_us", us("maximum_pulse_width", 2000.0)?);
         let degrees = section.number("maximum_servo_angle", Limit::Above(0.0))?.unwrap_or(180.0);
@@ -259,7 +245,7 @@ impl Translator<'_> {
         if let (Some(data), Some(clock)) = (data?, clock?) {
             let name = self.name_of("part", section);
             let count = section.whole("chain_count", 1)?.unwrap_or(1);
-            let part = Entry::default().set("kind", "apa102").set("name", name).set("count", count);
+            let part = Entry::of_kind("apa102").set("name", name).set("count", count);
             self.out.add("part", part.set("data_pin", data).set("clock_pin", clock));
         }
         Ok(())
@@ -280,7 +266,7 @@ impl Translator<'_> {
             }
             let count = section.whole("chain_count", 1)?.unwrap_or(1);
             self.out.add("spi_bus", Entry::default().set("name", pin.as_str()));
-            let part = Entry::default().set("kind", "ws2812").set("name", name).set("count", count);
+            let part = Entry::of_kind("ws2812").set("name", name).set("count", count);
             self.out.add("part", part.set("bus", pin).set("color_order", order));
         }
         Ok(())
@@ -319,24 +305,16 @@ impl Translator<'_> {
         if !["ssd1306", "sh1106"].contains(&kind) {
             return Ok(());
         }
-        if section.text("cs_pin").is_none() {
-            let bus = self.i2c(section)?;
-            let address = section.whole("i2c_address", 0)?.unwrap_or(60);
-            if !self.out.is_new_chip(&bus, address) {
-                return Ok(());
-            }
-            let name = self.name_of("part", section);
-            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
-            let part = part.set("address", address).set_if("reset_pin", self.take(section, "reset_pin")?);
-            self.out.add("part", part);
-        } else {
-            let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
-            let name = self.name_of("part", section);
-            let part = Entry::default().set("kind", "ssd1306").set("chip", kind).set("name", name).set("bus", bus);
-            let part = part.set_if("select_pin", select).set_if("dc_pin", self.take(section, "dc_pin")?);
-            let part = part.set_if("reset_pin", self.take(section, "reset_pin")?);
-            self.out.add("part", part);
+        let found = match section.text("cs_pin") {
+            None => self.chip_on_i2c(section, 60, "ssd1306")?,
+            Some(_) => self.chip_on_spi(section, "cs_pin", "ssd1306")?,
+        };
+        let Some(mut part) = found else { return Ok(()) };
+        part = part.set("chip", kind).set("name", self.name_of("part", section));
+        for key in ["dc_pin", "reset_pin"] {
+            part = part.set_if(key, self.take(section, key)?);
         }
+        self.out.add("part", part);
         Ok(())
     }
 
@@ -386,24 +364,17 @@ impl Translator<'_> {
             "bmi160" => Some(0x69),
             _ => None,
         };
-        let mut part = Entry::default().set("kind", "accelerometer").set("chip", chip);
-        part = part.set_if("name", section.own_name());
+        const KIND: &str = "accelerometer";
         let is_on_spi = section.text("cs_pin").is_some() && !matches!(chip, "mpu9250" | "icm20948");
-        part = match usual.filter(|_| !is_on_spi) {
-            Some(usual) => {
-                let bus = self.i2c(section)?;
-                let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
-                if !self.out.is_new_chip(&bus, address) {
-                    return Ok(());
-                }
-                part.set("bus", bus).set("address", address)
-            }
+        let found = match usual.filter(|_| !is_on_spi) {
+            Some(usual) => self.chip_on_i2c(section, usual, KIND)?,
             None => {
                 section.required("cs_pin")?;
-                let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
-                part.set("bus", bus).set_if("select_pin", select)
+                self.chip_on_spi(section, "cs_pin", KIND)?
             }
         };
+        let Some(part) = found else { return Ok(()) };
+        let mut part = part.set("chip", chip).set_if("name", section.own_name());
         let shaken =
             |axis: &str, hz: f64| Entry::default().set("axis", axis).set("hz", hz).set("damping_ratio", 0.06).0;
         for (axis, hz) in [("x", 52.0), ("y", 43.0)] {
@@ -420,9 +391,8 @@ impl Translator<'_> {
         let Some(axis) = section.text("stepper").and_then(|stepper| self.axes.get(stepper)).cloned() else {
             return Ok(());
         };
-        let Some((bus, select)) = self.spi(section, "cs_pin")? else { return Ok(()) };
-        let part = Entry::default().set("kind", "angle_sensor").set("chip", chip).set("axis", axis);
-        self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
+        let Some(part) = self.chip_on_spi(section, "cs_pin", "angle_sensor")? else { return Ok(()) };
+        self.out.add("part", part.set("chip", chip).set("axis", axis));
         Ok(())
     }
 
@@ -430,30 +400,23 @@ impl Translator<'_> {
         let kind = section.kind();
         let usual = match kind {
             "mcp4018" => 0x2f,
-            "pca9632" => 98,
-            "pca9533" => 98,
+            "pca9533" | "pca9632" => 98,
             _ => {
                 section.required("i2c_address")?;
                 0
             }
         };
-        let address = section.whole("i2c_address", 0)?.unwrap_or(usual);
-        let bus = self.i2c(section)?;
-        if !self.out.is_new_chip(&bus, address) {
-            return Ok(());
-        }
+        let Some(part) = self.chip_on_i2c(section, usual, "i2c_register")? else { return Ok(()) };
         let name = self.name_of("part", section);
-        let part = Entry::default().set("kind", "i2c_register").set("name", name).set("chip", kind).set("bus", bus);
-        self.out.add("part", part.set("address", address));
+        self.out.add("part", part.set("name", name).set("chip", kind));
         Ok(())
     }
 
     fn dac(&mut self, section: &Section) -> Result<(), Trouble> {
         section.required("enable_pin")?;
-        let Some((bus, select)) = self.spi(section, "enable_pin")? else { return Ok(()) };
+        let Some(part) = self.chip_on_spi(section, "enable_pin", "spi_dac")? else { return Ok(()) };
         let name = self.name_of("part", section);
-        let part = Entry::default().set("kind", "spi_dac").set("name", name).set("chip", section.kind().to_lowercase());
-        self.out.add("part", part.set("bus", bus).set_if("select_pin", select));
+        self.out.add("part", part.set("name", name).set("chip", section.kind().to_lowercase()));
         Ok(())
     }
 }

@@ -6,7 +6,7 @@ use pinion_printer_config::{Section, Trouble};
 
 use super::description::Entry;
 use super::known::motor_of;
-use super::translate::Translator;
+use super::translator::Translator;
 
 /// Highest address of a driver on a UART.
 const ADDRESS_MAX: i64 = 3;
@@ -45,7 +45,7 @@ impl Translator<'_> {
         let Some((bus, select)) = self.spi(first.filter(|_| chain.is_some()).unwrap_or(section), "cs_pin")? else {
             return Ok(());
         };
-        let mut part = Entry::default().set("kind", kind).set("axis", axis).set("bus", bus);
+        let mut part = Entry::of_kind(kind).set("axis", axis).set("bus", bus);
         part = match chain {
             Some(length) => {
                 section.required("chain_position")?;
@@ -81,7 +81,7 @@ impl Translator<'_> {
         self.take_pin(section, &pin);
         // The description has another kind of a TMC2240 on SPI.
         let part = if kind == "tmc2240" { "tmc2240_uart" } else { kind };
-        let mut part = Entry::default().set("kind", part).set("axis", axis).set("uart_pin", pin.to_string());
+        let mut part = Entry::of_kind(part).set("axis", axis).set("uart_pin", pin.to_string());
         let mut selects: Vec<toml::Value> = Vec::new();
         for text in section.list("select_pins", ',') {
             let select = self.pin_of(section, "select_pins", text)?;

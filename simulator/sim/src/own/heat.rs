@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Heaters, their sensors, and fans.
 
-use pinion_printer_config::{Limit, Section, Trouble};
+use pinion_printer_config::{Config, Limit, Section, Trouble};
 
 use super::description::Entry;
 use super::sensors::{is_known, mcu_at_40, sensor};
-use super::translate::{Pace, Translator};
+use super::translator::{Pace, Translator};
 
 /// Temperature of the surroundings.
 const AMBIENT_CELSIUS: f64 = 25.0;
@@ -40,10 +40,26 @@ fn has_sensor(kind: &str) -> bool {
         .contains(&kind)
 }
 
-/// The first sensor that a combined sensor reads: the name of its section.
-fn first_sensor(section: &Section) -> Option<&str> {
-    let is_combined = section.text("sensor_type") == Some("temperature_combined");
-    section.list("sensor_list", ',').first().copied().filter(|_| is_combined)
+/// Whether klippy measures this section's temperature at a thing of the printer that a heater can heat.
+fn is_heated(section: &Section) -> bool {
+    let is_other = |kind: &str| {
+        let others = ["temperature_mcu", "temperature_host", "temperature_combined"];
+        others.contains(&kind) || kind.starts_with("mpc_")
+    };
+    section.text("heater_pin").is_none() && section.text("sensor_type").is_some_and(|kind| !is_other(kind))
+}
+
+/// The section of a combined sensor that a heater with that sensor heats: the first one that it can heat.
+fn heated_by<'a>(config: &'a Config, heater: &Section) -> Option<&'a Section> {
+    let is_combined = heater.text("heater_pin").is_some() && heater.text("sensor_type") == Some("temperature_combined");
+    let names = heater.list("sensor_list", ',').into_iter().filter(|_| is_combined);
+    names.filter_map(|name| config.section(name)).find(|section| is_heated(section))
+}
+
+/// The heater that heats this sensor, and has it in its combined one.
+fn heater_of<'a>(config: &'a Config, sensor: &Section) -> Option<&'a Section> {
+    let is_it = |heater: &&Section| heated_by(config, heater).is_some_and(|heated| heated.name == sensor.name);
+    config.sections().iter().find(is_it)
 }
 
 impl Translator<'_> {
@@ -65,15 +81,13 @@ impl Translator<'_> {
                 None => Ok(()),
             };
         };
-        let measured = first_sensor(section).and_then(|name| self.config.section(name));
-        if measured.is_some() && section.text("heater_pin").is_some() {
-            // What its first sensor measures has the heater.
+        let is_same = |other: &Section| other.name == section.name;
+        if heated_by(self.config, section).and_then(|sensor| heater_of(self.config, sensor)).is_some_and(is_same) {
+            // The heater is at that sensor.
             return Ok(());
         }
         let klippys = section.own_name().unwrap_or(&section.name).to_owned();
-        // The section with the power that heats this sensor.
-        let mut others = self.config.sections().iter().filter(|other| other.text("heater_pin").is_some());
-        let powered = others.find(|other| first_sensor(other) == Some(&section.name)).unwrap_or(section);
+        let powered = heater_of(self.config, section).unwrap_or(section);
         let name = self.out.name("heater", &klippys);
         // A pin of another chip drives nothing here, and klippy needs one.
         let nothing = powered.text("heater_pin").map(|_| self.out.name("nothing", &format!("nothing_{name}")));
@@ -124,7 +138,13 @@ impl Translator<'_> {
         }
         match kind {
             "temperature_mcu" => self.mcu_thermometer(section),
-            "temperature_host" | "temperature_combined" | "mpc_block_temperature" | "mpc_ambient_temperature" => Ok(()),
+            "temperature_host" | "temperature_combined" | "mpc_block_temperature" | "mpc_ambient_temperature" => {
+                if pin.is_some() {
+                    // klippy needs the pin.
+                    self.out.add("heater", entry);
+                }
+                Ok(())
+            }
             _ => {
                 self.heaters.insert(klippys, name.clone());
                 self.out.add("heater", entry);
@@ -147,14 +167,12 @@ impl Translator<'_> {
 
     /// A sensor that is a chip of its own.
     fn chip_thermometer(&mut self, section: &Section, kind: &str, heater: &str) -> Result<(), Trouble> {
-        let part = Entry::default().set("heater", heater);
         let number = |key: &str, default: f64| section.number(key, Limit::Any).map(|n| n.unwrap_or(default));
         match kind {
             "MAX6675" | "MAX31855" | "MAX31856" | "MAX31865" => {
-                let Some((bus, select)) = self.spi(section, "sensor_pin")? else { return Ok(()) };
+                let Some(part) = self.chip_on_spi(section, "sensor_pin", "thermocouple")? else { return Ok(()) };
                 let name = self.out.name("part", heater);
-                let part = part.set("kind", "thermocouple").set("chip", kind.to_lowercase()).set("name", name);
-                let part = part.set("bus", bus).set_if("select_pin", select);
+                let part = part.set("heater", heater).set("chip", kind.to_lowercase()).set("name", name);
                 let part = match kind {
                     "MAX31865" => {
                         let part = part.set("rtd_ohm", number("rtd_nominal_r", 100.0)?);
@@ -172,7 +190,8 @@ impl Translator<'_> {
                     self.note(section, &cause, "name one in /sys/bus/w1/devices, such as 28-0123456789ab");
                 }
                 let name = self.out.name("part", heater);
-                self.out.add("part", part.set("kind", "ds18b20").set("name", name).set("serial", serial));
+                let part = Entry::of_kind("ds18b20").set("heater", heater);
+                self.out.add("part", part.set("name", name).set("serial", serial));
             }
             "BME280" | "HTU21D" | "SHT21" | "SI7013" | "SI7020" | "SI7021" | "SHT3X" | "AHT10" | "AHT1X" | "AHT2X"
             | "AHT3X" | "LM75" => {
@@ -183,14 +202,9 @@ impl Translator<'_> {
                     "LM75" => ("lm75", 72),
                     _ => ("htu21d", 64),
                 };
-                let address = section.whole("i2c_address", 0)?.unwrap_or(address);
-                let bus = self.i2c(section)?;
-                if !self.out.is_new_chip(&bus, address) {
-                    return Ok(());
-                }
+                let Some(part) = self.chip_on_i2c(section, address, "i2c_sensor")? else { return Ok(()) };
                 let name = self.out.name("part", heater);
-                let part = part.set("kind", "i2c_sensor").set("name", name).set("chip", chip).set("bus", bus);
-                self.out.add("part", part.set("address", address));
+                self.out.add("part", part.set("heater", heater).set("name", name).set("chip", chip));
             }
             _ if is_known(self.config, kind) => {}
             _ => {

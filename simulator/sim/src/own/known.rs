@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use pinion_printer_config::{Config, Section};
+use pinion_system::klippy::has_module;
 
 /// The meaning of a section here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,23 +46,7 @@ pub(crate) fn kind_of(word: &str) -> Kind {
 pub(super) fn near(word: &str) -> Option<&'static str> {
     // A short word of a plugin is near to many others.
     const LETTERS_MIN: usize = 5;
-    known().find(|known| word.len() >= LETTERS_MIN && is_near(word, known))
-}
-
-/// Whether one edit makes one word of the other: a letter more, less or another one, or two that are swapped.
-fn is_near(one: &str, other: &str) -> bool {
-    let (mut one, mut other): (Vec<char>, Vec<char>) = (one.chars().collect(), other.chars().collect());
-    for _ in 0..2 {
-        // The common end goes, then the common beginning.
-        while one.last().is_some_and(|last| other.last() == Some(last)) {
-            one.pop();
-            other.pop();
-        }
-        one.reverse();
-        other.reverse();
-    }
-    let is_swapped = one.len() == 2 && other.len() == 2 && one[0] == other[1] && one[1] == other[0];
-    one != other && (one.len().max(other.len()) == 1 || is_swapped)
+    known().find(|known| word.len() >= LETTERS_MIN && strsim::osa_distance(word, known) == 1)
 }
 
 /// Sections of klippy without a module of their own.
@@ -85,11 +70,7 @@ const WITHOUT_MODULE: &[&str] = &[
 pub(super) fn lacks_module(word: &str, klipper: Option<&Path>) -> bool {
     let Some(klipper) = klipper else { return kind_of(word) == Kind::Strange };
     let is_built_in = WITHOUT_MODULE.contains(&word) || word.starts_with("stepper_") || is_numbered(word, "extruder");
-    let has = |folder: &str| {
-        let module = klipper.join("klippy").join(folder).join(word);
-        module.with_extension("py").exists() || module.join("__init__.py").exists()
-    };
-    !is_built_in && !["extras", "plugins"].into_iter().any(has)
+    !is_built_in && !has_module(&klipper.join("klippy"), word)
 }
 
 /// klippy's sections that make the probe, beside `[probe]`.
@@ -109,6 +90,37 @@ pub(super) fn is_left_over(config: &Config, section: &Section) -> bool {
 /// The name of the section of a driver's motor.
 pub(super) fn motor_of(driver: &Section) -> &str {
     driver.name.split_once(' ').map_or("", |(_, motor)| motor.trim())
+}
+
+/// The kinematics of Klipper and Kalico. Of names within each other, the longer one comes first.
+const KINEMATICS: [&str; 15] = [
+    "limited_cartesian",
+    "limited_corexy",
+    "limited_corexz",
+    "hybrid_corexy",
+    "hybrid_corexz",
+    "generic_cartesian",
+    "rotary_delta",
+    "cartesian",
+    "corexy",
+    "corexz",
+    "deltesian",
+    "delta",
+    "polar",
+    "winch",
+    "none",
+];
+
+/// Whether klippy has these kinematics.
+pub(super) fn has_kinematics(kinematics: &str) -> bool {
+    KINEMATICS.contains(&kinematics)
+}
+
+/// The kinematics that stand for these: their own, or those that the name of a plugin's ends with.
+pub(super) fn simulated_kinematics(kinematics: &str) -> Option<&'static str> {
+    KINEMATICS
+        .into_iter()
+        .find(|known| kinematics == *known || kinematics.strip_suffix(known).is_some_and(|rest| rest.ends_with('_')))
 }
 
 #[cfg(test)]

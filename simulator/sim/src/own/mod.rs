@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Somebody's own printer.cfg as a simulated printer.
 //!
-//! - `translate`: sections become a description, as a table of TOML; `motion`, `heat`, `devices` are its parts
+//! - `translate`: sections become a description, as a table of TOML; `motion`, `heat`, `devices`, `drivers` are its parts
+//! - `translator`: the pins, buses and notes that these parts share
 //! - `sensors`: the tables of thermistors and amplifiers
 //! - `klippy`: klippy's own verdict; without a klippy, `rules` and `claims` find the most frequent mistakes
 //! - `known`: the sections of Klipper and Kalico; `plugins`: those that the copy is without
@@ -23,11 +24,12 @@ pub(crate) mod run;
 mod sensors;
 pub(crate) mod serve;
 mod translate;
+mod translator;
 
 pub(crate) use known::{Kind, kind_of};
-pub(crate) use translate::Pace;
 #[cfg(test)]
 use translate::{Translated, translate};
+pub(crate) use translator::Pace;
 
 #[cfg(test)]
 mod tests;

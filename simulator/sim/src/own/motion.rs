@@ -6,7 +6,8 @@ use std::collections::HashMap;
 use pinion_printer_config::{Limit, Section, Trouble};
 
 use super::description::Entry;
-use super::translate::Translator;
+use super::known::simulated_kinematics;
+use super::translator::Translator;
 
 /// Where a rail begins, in front of its endstop.
 const BEFORE_ENDSTOP_MM: f64 = 15.0;
@@ -51,37 +52,6 @@ enum Endstop {
     Other,
 }
 
-/// The kinematics of Klipper and Kalico. Of names within each other, the longer one comes first.
-const KINEMATICS: [&str; 15] = [
-    "limited_cartesian",
-    "limited_corexy",
-    "limited_corexz",
-    "hybrid_corexy",
-    "hybrid_corexz",
-    "generic_cartesian",
-    "rotary_delta",
-    "cartesian",
-    "corexy",
-    "corexz",
-    "deltesian",
-    "delta",
-    "polar",
-    "winch",
-    "none",
-];
-
-/// Whether klippy has these kinematics.
-pub(super) fn is_known(kinematics: &str) -> bool {
-    KINEMATICS.contains(&kinematics)
-}
-
-/// The kinematics that stand for these: their own, or those that the name of a plugin's ends with.
-fn simulated(kinematics: &str) -> Option<&'static str> {
-    KINEMATICS
-        .into_iter()
-        .find(|known| kinematics == *known || kinematics.strip_suffix(known).is_some_and(|rest| rest.ends_with('_')))
-}
-
 impl<'a> Translator<'a> {
     pub(super) fn motion(&mut self) -> Result<(), Trouble> {
         let Some(printer) = self.config.section("printer") else {
@@ -89,7 +59,7 @@ impl<'a> Translator<'a> {
             return Err(Trouble::new(cause).remedy("add [printer]"));
         };
         let named = printer.required("kinematics")?;
-        let Some(kind) = simulated(named) else {
+        let Some(kind) = simulated_kinematics(named) else {
             let cause = format!("Error loading kinematics '{named}'");
             return Err(printer.trouble("kinematics", cause).remedy("name one of Klipper's kinematics"));
         };

@@ -3,8 +3,7 @@
 
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
-use super::known::{Kind, kind_of, motor_of, near};
-use super::motion;
+use super::known::{Kind, has_kinematics, kind_of, motor_of, near};
 use super::sensors::is_known;
 
 /// Checks all sections.
@@ -38,7 +37,7 @@ fn checked(config: &Config, section: &Section, has_plugin: bool) -> Result<(), T
         let cause = format!("Unknown temperature sensor '{sensor}'");
         return refused("sensor_type", cause, "correct it, or add [thermistor] or [adc_temperature]");
     }
-    if let Some(kinematics) = section.text("kinematics").filter(|named| !has_plugin && !motion::is_known(named)) {
+    if let Some(kinematics) = section.text("kinematics").filter(|named| !has_plugin && !has_kinematics(named)) {
         let cause = format!("Error loading kinematics '{kinematics}'");
         return refused("kinematics", cause, "name one of Klipper's kinematics");
     }

@@ -10,11 +10,12 @@ use nix::unistd::geteuid;
 use pinion_linux::foreign::plain;
 use pinion_linux::own_folder::OwnFolder;
 use pinion_printer_config::Trouble;
+use pinion_printer_config::pins::section_of;
 use toml::Table;
 
 use super::args::OwnArgs;
 use super::klippy::Klippy;
-use super::serve::{Folder, Own, Reading, section_of};
+use super::serve::{Folder, Own, Reading};
 use super::translate::check;
 use crate::description::text;
 

@@ -4,6 +4,7 @@
 //! The numbers are those of Klipper's `klippy/extras/temperature_sensors.cfg` and `adc_temperature.py` (GPL-3.0). Each has
 //! its origin there: the makers' data sheets.
 
+use pinion_model::{NoThermistor, Thermistor};
 use pinion_printer_config::{Config, Limit, Section, Trouble};
 
 use super::description::Entry;
@@ -192,15 +193,16 @@ pub(super) fn sensor(config: &Config, section: &Section, entry: Entry) -> Result
     };
     let pullup_ohm = section.number("pullup_resistor", Limit::Above(0.0))?.unwrap_or(PULLUP_OHM);
     let inline_ohm = section.number("inline_resistor", Limit::Min(0.0))?.unwrap_or(0.0);
-    let thermistor = |entry: Entry, points: &Points, beta: Option<f64>| match inline_ohm > 0.0 {
-        false => entry
+    let thermistor = |entry: Entry, points: &Points, beta: Option<f64>| match Thermistor::new(points, beta, pullup_ohm)
+    {
+        Ok(curve) if inline_ohm > 0.0 => {
+            let ohms = |celsius: f64| curve.ohm(celsius) + inline_ohm;
+            fractions(entry, (-50..400).step_by(5).map(f64::from).map(|c| (c, ohms(c) / (pullup_ohm + ohms(c)))))
+        }
+        _ => entry
             .set("pullup_ohm", pullup_ohm)
             .rows("points_celsius_ohm", points.iter().map(|(celsius, ohm)| [*celsius, *ohm]))
             .set_if("beta_k", beta),
-        true => {
-            let ohms = |celsius: f64| resistance(points, beta, celsius) + inline_ohm;
-            fractions(entry, (-50..400).step_by(5).map(f64::from).map(|c| (c, ohms(c) / (pullup_ohm + ohms(c)))))
-        }
     };
     let volts = |entry: Entry, points: &mut dyn Iterator<Item = (f64, f64)>| {
         let volt = number(section, "adc_voltage", 5.0)?;
@@ -258,38 +260,19 @@ pub(super) fn sensor(config: &Config, section: &Section, entry: Entry) -> Result
 /// The points that count. Through some three points no thermistor's curve leads, and klippy takes the first one with the
 /// beta between the first and the last (`thermistor.py`).
 fn as_klippy_takes_them(points: &Points, beta: Option<f64>) -> (&Points, Option<f64>) {
-    let (Some(&[(t1, r1), (t2, r2), (t3, r3)]), None) = (points.first_chunk(), beta) else { return (points, beta) };
-    let inverse = |celsius: f64| 1.0 / (celsius + KELVIN);
-    let (l1, l2, l3) = (r1.ln(), r2.ln(), r3.ln());
-    let (by12, by13) = (inverse(t1) - inverse(t2), inverse(t1) - inverse(t3));
-    let ratio = (l1 - l2) / (l1 - l3);
-    let c3 = (by12 - by13 * ratio) / (l1.powi(3) - l2.powi(3) - (l1.powi(3) - l3.powi(3)) * ratio);
-    if c3 > 0.0 { (points, None) } else { (&points[..1], Some((l1 - l3) / by13)) }
+    match (points, Thermistor::new(points, beta, PULLUP_OHM)) {
+        ([(t1, r1), _, (t3, r3)], Err(NoThermistor::PointsOnNoCurve)) => {
+            let inverse = |celsius: f64| 1.0 / (celsius + KELVIN);
+            (&points[..1], Some((r1.ln() - r3.ln()) / (inverse(*t1) - inverse(*t3))))
+        }
+        _ => (points, beta),
+    }
 }
 
 /// A curve as fractions of the ADC's reference, as far as the ADC measures them.
 fn fractions(entry: Entry, points: impl Iterator<Item = (f64, f64)>) -> Entry {
     let points = points.filter(|(_, fraction)| (0.0..=1.0).contains(fraction));
     entry.rows("points_celsius_fraction", points.map(|(celsius, fraction)| [celsius, fraction]))
-}
-
-/// The resistance of a thermistor, by Steinhart and Hart.
-fn resistance(points: &Points, beta: Option<f64>, celsius: f64) -> f64 {
-    let inverse = |celsius: f64| 1.0 / (celsius + KELVIN);
-    let y = inverse(celsius);
-    match (points, beta) {
-        ([(t, r), ..], Some(beta)) => r * (beta * (y - inverse(*t))).exp(),
-        ([(t1, r1), (t2, r2), (t3, r3)], None) => {
-            let (l1, l2, l3) = (r1.ln(), r2.ln(), r3.ln());
-            // The curve through three points: the interpolation of ln R over 1/T by Lagrange is near enough.
-            let (a, b, c) = (inverse(*t1), inverse(*t2), inverse(*t3));
-            let ln = l1 * (y - b) * (y - c) / ((a - b) * (a - c))
-                + l2 * (y - a) * (y - c) / ((b - a) * (b - c))
-                + l3 * (y - a) * (y - b) / ((c - a) * (c - b));
-            ln.exp()
-        }
-        _ => PULLUP_OHM,
-    }
 }
 
 /// The fraction that an MCU's own sensor reads at 40 °C, by klippy's formula for this chip (`temperature_mcu.py`).

@@ -12,13 +12,14 @@ use pinion_linux::foreign::{self, word};
 use pinion_linux::own_folder::OwnFolder;
 use pinion_model::SimConfig;
 use pinion_printer_config::copy::{self, Change};
-use pinion_printer_config::pins::MAIN;
+use pinion_printer_config::pins::{MAIN, section_of};
 use pinion_printer_config::{Config, Section, Trouble};
 use pinion_runtime::klippy::is_host_path;
 use toml::{Table, Value};
 
 use super::plugins::{LeftOut, StandIn, stand_in};
-use super::translate::{Pace, Pins, Translated, check, translate};
+use super::translate::{Translated, check, translate};
+use super::translator::{Pace, Pins};
 use crate::boards::links_of;
 
 /// The ways to an MCU in its section.
@@ -173,11 +174,6 @@ pub(crate) struct Folder {
     pub(super) links: Vec<PathBuf>,
     /// The sections that the copy does not have.
     pub(crate) left_out: Vec<String>,
-}
-
-/// The section of an MCU.
-pub(crate) fn section_of(mcu: &str) -> String {
-    if mcu == MAIN { mcu.to_owned() } else { format!("mcu {mcu}") }
 }
 
 impl Folder {

@@ -293,17 +293,37 @@ fn a_probe_as_endstop_leaves_position_endstop_without_a_meaning() {
 }
 
 #[test]
-fn a_heater_with_a_combined_sensor_heats_what_its_first_sensor_measures() {
-    let dryer = "[temperature_sensor box]\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: PA4\n[heater_generic dryer]\n\
-                 heater_pin: PD9\nmax_power: 0.5\nsensor_type: temperature_combined\nsensor_list: temperature_sensor box,\n  \
-                 temperature_host a\ncombination_method: mean\nmaximum_deviation: 50\ncontrol: watermark\n\
-                 min_temp: 0\nmax_temp: 90\n[extruder]";
-    let description = translated(&PRINTER.replace("[extruder]", dryer)).unwrap().description;
-    let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
-    let found: Vec<_> = heaters.filter(|heater| heater.get("pin") == Some(&Value::from("PD9"))).collect();
-    let [heater] = found[..] else { panic!("{description}") };
-    assert_eq!(heater["name"].as_str(), Some("box"));
-    assert!(heater["heater_watts"].as_float().unwrap() > 0.0);
+fn a_heater_with_a_combined_sensor_heats_the_first_sensor_that_it_can_heat() {
+    let sensor = "[temperature_sensor box]\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: PA4\n\
+                  [temperature_sensor pi]\nsensor_type: temperature_host\n";
+    let heater = |name: &str, pin: &str, sensors: &str| {
+        format!(
+            "[heater_generic {name}]\nheater_pin: {pin}\nmax_power: 0.5\nsensor_type: temperature_combined\n\
+             sensor_list: {sensors}\ncombination_method: mean\nmaximum_deviation: 50\ncontrol: watermark\n\
+             min_temp: 0\nmax_temp: 90\n"
+        )
+    };
+    let named = |text: String, pin: &str| {
+        let description = translated(&PRINTER.replace("[extruder]", &(text + "[extruder]"))).unwrap().description;
+        let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
+        let found: Vec<_> = heaters.filter(|heater| heater.get("pin") == Some(&Value::from(pin))).collect();
+        let [heater] = found[..] else { panic!("{pin}: {description}") };
+        assert!(heater["heater_watts"].as_float().unwrap() > 0.0);
+        heater["name"].as_str().unwrap().to_owned()
+    };
+    let both = "temperature_sensor box,\n  temperature_sensor pi";
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", both), "PD9"), "box");
+    let host_first = "temperature_sensor pi, temperature_sensor box";
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", host_first), "PD9"), "box");
+    // A heater that can heat none of its sensors, because the box has one, or the bed has its own.
+    let two = || sensor.to_owned() + &heater("dryer", "PD9", both) + &heater("chamber", "PD10", both);
+    assert_eq!([named(two(), "PD9"), named(two(), "PD10")], ["box", "chamber"]);
+    for sensors in ["temperature_sensor pi", "extruder, temperature_sensor pi"] {
+        assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", sensors), "PD9"), "dryer");
+    }
+    let of_extruder = PRINTER.split("[extruder]").nth(1).unwrap().split("heater_pin:").nth(1).unwrap();
+    let of_extruder = of_extruder.lines().next().unwrap().trim();
+    assert_eq!(named(sensor.to_owned() + &heater("dryer", "PD9", "extruder"), of_extruder), "extruder");
 }
 
 #[test]
@@ -329,4 +349,33 @@ fn a_klicky_is_in_its_dock_a_weak_heater_heats_and_a_fast_carriage_has_room() {
     assert!((watts("[extruder]\nmax_power: 0.4") * 0.4 - watts("[extruder]")).abs() < 1e-9);
     let room = |text: &str| of(text, "axis", "name", "x")["overtravel_mm"].as_float().unwrap();
     assert_eq!(room(&PRINTER.replace("[stepper_x]", "[stepper_x]\nhoming_speed: 150")), 6.0);
+}
+
+#[test]
+fn a_thermistor_reads_as_klippy_calculates_it() {
+    let of = |more: &str| {
+        let sensor = "[temperature_sensor own]\nsensor_pin: PA2\nmin_temp: 0\nmax_temp: 100\n";
+        let description = translated(&format!("{PRINTER}\n{sensor}{more}")).unwrap().description;
+        let heaters = description["heater"].as_array().unwrap().iter().filter_map(Value::as_table);
+        let found: Vec<Table> =
+            heaters.filter(|heater| heater.get("name") == Some(&Value::from("own"))).cloned().collect();
+        found.into_iter().next().unwrap()
+    };
+    let rows = |table: &Table, key: &str| -> Vec<Vec<f64>> { table[key].clone().try_into().unwrap() };
+    // The resistor in series adds to the thermistor, also between its points.
+    let inline = of("sensor_type: Generic 3950\ninline_resistor: 1000\n");
+    let fraction_at = |celsius: f64| {
+        let found = rows(&inline, "points_celsius_fraction").into_iter().find(|point| point[0] == celsius);
+        found.unwrap()[1]
+    };
+    assert!((fraction_at(25.0) - 101_000.0 / 105_700.0).abs() < 1e-9);
+    assert!((fraction_at(150.0) - 2770.0 / 7470.0).abs() < 1e-9);
+    // By klippy's thermistor.py.
+    assert!((fraction_at(100.0) - 0.626_166_716_577).abs() < 1e-9, "{}", fraction_at(100.0));
+    // No curve leads through these points: klippy takes the beta between the first and the last.
+    let points = "temperature1: 25\nresistance1: 100000\ntemperature2: 100\nresistance2: 1000\n\
+                  temperature3: 200\nresistance3: 100\n";
+    let beta = of(&format!("sensor_type: mine\n[thermistor mine]\n{points}"));
+    assert_eq!(rows(&beta, "points_celsius_ohm"), [[25.0, 100_000.0]]);
+    assert!((beta["beta_k"].as_float().unwrap() - 5568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
 }

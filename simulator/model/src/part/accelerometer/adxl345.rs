@@ -17,6 +17,7 @@ const MULTIPLE_BYTES: u8 = 0x40;
 const ADDRESS: u8 = 0x3f;
 
 const DEVID: u8 = 0x00;
+const THRESH_TAP: u8 = 0x1d;
 const OFSX: u8 = 0x1e;
 const ACT_TAP_STATUS: u8 = 0x2b;
 const BW_RATE: u8 = 0x2c;
@@ -66,7 +67,7 @@ impl Adxl345 {
     pub(super) fn new(head: Head) -> Adxl345 {
         Adxl345 {
             head,
-            registers: RegisterMap::holding(0x40, REGISTERS),
+            registers: RegisterMap::holding(THRESH_TAP.into()..0x3a, REGISTERS),
             fifo: Fifo::new(FIFO + 1),
             data_read: false,
             status: 0,
@@ -178,8 +179,6 @@ mod tests {
     use super::super::head::{DELAY_TICKS, G_MM_PER_S2, TURN_ON_S};
     use super::super::tests::{Bench, DAMPING, READ, X_HZ};
     use super::*;
-
-    const THRESH_TAP: u8 = 0x1d;
     use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource as _};
     use std::f64::consts::TAU;
 
@@ -210,7 +209,9 @@ mod tests {
     #[test]
     fn registers_are_as_in_the_data_sheet() {
         let mut bench = bench(0.0);
-        for (register, value) in [(DEVID, 0xe5), (BW_RATE, 0x0a), (POWER_CTL, 0), (INT_SOURCE, 2), (FIFO_STATUS, 0)] {
+        for (register, value) in
+            [(DEVID, 0xe5), (0x01, 0), (BW_RATE, 0x0a), (POWER_CTL, 0), (INT_SOURCE, 2), (FIFO_STATUS, 0), (0x3a, 0)]
+        {
             assert_eq!(bench.read(register), value, "{register:#04x}");
             bench.write(register, 0x55);
             let kept = matches!(register, BW_RATE | POWER_CTL);

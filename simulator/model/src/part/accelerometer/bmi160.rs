@@ -48,7 +48,11 @@ pub(super) struct Bmi160 {
 
 impl Bmi160 {
     pub(super) fn new(head: Head) -> Bmi160 {
-        Bmi160 { head, registers: RegisterMap::holding(0x80, REGISTERS), fifo: Fifo::new(FIFO / SAMPLE) }
+        Bmi160 {
+            head,
+            registers: RegisterMap::holding(ACC_CONF.into()..0x80, REGISTERS),
+            fifo: Fifo::new(FIFO / SAMPLE),
+        }
     }
 
     fn catch_up(&mut self) {
@@ -131,6 +135,8 @@ mod tests {
                 if is_spi { bench.write(register, value) } else { bench.i2c_write(register, value) }
             }
             assert_eq!(bench.read(ACC_CONF), 0x2c, "klippy reads it back");
+            bench.write(ACC_CONF - 1, 0x55);
+            assert_eq!(bench.read(ACC_CONF - 1), 0, "no settings are below");
             bench.wait(TURN_ON_S + 10.5 / 1600.0);
             let length = |bench: &mut Bench<Bmi160>| u16::from_le_bytes(bench.i2c_read(FIFO_LENGTH));
             assert_eq!(length(&mut bench), 60);

@@ -140,7 +140,7 @@ pub(super) struct Lis {
 
 impl Lis {
     pub(super) fn new(model: &'static Model, head: Head) -> Lis {
-        let mut registers = RegisterMap::holding(0x80, model.resets);
+        let mut registers = RegisterMap::holding(0..0x80, model.resets);
         registers.add(&[Register(WHO_AM_I, Access::Read, 0, model.id)]);
         Lis { model, head, registers, fifo: Fifo::new(FIFO) }
     }

@@ -47,7 +47,7 @@ impl Map {
     /// The registers at power-up: the best clock, and an ICM-20948 sleeps.
     fn resets(&self) -> Registers {
         let power = if self.bank_sel.is_some() { SLEEP | 1 } else { 1 };
-        let mut banks = [(); 4].map(|()| RegisterMap::holding(0x80, &[]));
+        let mut banks = [(); 4].map(|()| RegisterMap::holding(0..0x80, &[]));
         banks[0].add(&[
             Register(self.who_am_i.0, Access::Read, 0, self.who_am_i.1),
             Register(self.pwr_mgmt_1, Access::ReadWrite, 0xff, power),

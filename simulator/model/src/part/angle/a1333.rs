@@ -52,7 +52,7 @@ impl SpiChip for A1333 {
 
     fn deselect(&mut self) {
         // A write needs a code that no host has here.
-        if let Some([first, _]) = self.frame.message().filter(|[first, _]| first & 0x40 == 0) {
+        if let Some([first, _]) = self.frame.message().filter(|[first, _]| self.frame.count == 2 && first & 0x40 == 0) {
             self.address = first & 0x3f;
         }
     }
