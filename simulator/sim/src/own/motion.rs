@@ -203,6 +203,25 @@ impl<'a> Translator<'a> {
         }
     }
 
+    /// A start near `start` from which the motor meets its endstop in the phase that is saved for it (`[endstop_phase]`).
+    /// klippy counts the phase from the motor's place when the MCU or the driver starts.
+    fn in_phase(&mut self, section: &Section, rail: &Rail, endstop: &Endstop, start: f64) -> Result<f64, Trouble> {
+        let saved = self.config.section(&format!("endstop_phase {}", section.name));
+        let saved = saved.and_then(|saved| saved.text("trigger_phase")?.split_once('/'));
+        let saved = saved.and_then(|(phase, of)| Some((phase.trim().parse().ok()?, of.trim().parse().ok()?)));
+        let (Endstop::Switch(_), Some((phase, of))) = (endstop, saved) else { return Ok(start) };
+        let (phase, of): (f64, f64) = (phase, of);
+        let steps_per_mm = Translator::steps_per_mm(section)?;
+        let phases = 4 * section.whole("microsteps", 1)?.unwrap_or(16) as i64;
+        // As klippy rounds it (`convert_phase`).
+        let wanted = (phase / of * phases as f64 + 0.5) as i64;
+        let [from, to] = [start, rail.endstop].map(|mm| (mm * steps_per_mm).round() as i64);
+        let missing = (wanted - (to - from)).rem_euclid(phases);
+        let from = if rail.at_max { from - missing } else { from + (phases - missing) % phases };
+        self.in_phase.insert(section.name.clone());
+        Ok(from as f64 / steps_per_mm)
+    }
+
     /// The section of a motor that the kinematics need.
     fn stepper(&self, axis: &str) -> Result<&'a Section, Trouble> {
         let config = self.config;
@@ -217,6 +236,7 @@ impl<'a> Translator<'a> {
         let entry = self.motor(section, name)?;
         let endstop = self.endstop(section)?;
         let rail = Rail { min, max: highest, endstop: highest, at_max: true, overtravel: OVERTRAVEL_MM };
+        let start = self.in_phase(section, &rail, &endstop, start)?;
         self.out.add("axis", Translator::with_rail(entry, &rail, &endstop, start));
         Ok(())
     }
@@ -231,6 +251,7 @@ impl<'a> Translator<'a> {
             ("z", false) => rail.min.max(0.0) + START_HEIGHT_MM,
             _ => rail.before_endstop(),
         };
+        let start = self.in_phase(section, &rail, &endstop, start)?;
         let others: Vec<&Section> =
             (1..100).map_while(|n| self.config.section(&format!("stepper_{axis}{n}"))).collect();
         let places = if axis == "z" { self.z_places(1 + others.len())? } else { None };

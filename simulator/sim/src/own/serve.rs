@@ -3,6 +3,7 @@
 //!
 //! The user's files are never changed. The copy differs in the way to each MCU and in the places where klippy writes.
 
+use std::collections::BTreeSet;
 use std::fs::{self, Metadata};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -38,6 +39,8 @@ pub(crate) struct Own {
     /// The MCUs, the main one first.
     pub(crate) mcus: Vec<String>,
     pub(crate) notes: Vec<Trouble>,
+    /// The steppers whose endstops have the phases that are saved for them.
+    in_phase: BTreeSet<String>,
     /// What klippy's copy is without.
     pub(super) left_out: LeftOut,
 }
@@ -65,9 +68,10 @@ impl Own {
     /// It is no printer, or has a mistake.
     pub(super) fn read(path: &Path, reading: Reading<'_>) -> Result<Own, Trouble> {
         let (config, left_out, translated) = read(path, &reading)?;
-        let Translated { mut description, mcus, pins, notes } = translated;
+        let Translated { mut description, mcus, pins, notes, mut in_phase } = translated;
         if let Some(built_like) = reading.built_like {
-            let (_, _, built) = read(built_like, &reading)?;
+            let (_, _, mut built) = read(built_like, &reading)?;
+            in_phase = std::mem::take(&mut built.in_phase);
             if built.mcus != mcus {
                 let cause = format!("it has the MCUs {}, and {} has others", built.mcus.join(", "), path.display());
                 return Err(Trouble::new(cause).of(built_like.display()).remedy("name a printer.cfg of this printer"));
@@ -80,7 +84,7 @@ impl Own {
         let name = path.display();
         let description = toml::to_string(&description).map_err(|error| Trouble::new(error.to_string()).of(&name))?;
         let sim = SimConfig::parse(&description, &format!("the printer that {name} describes"))?;
-        Ok(Own { config, sim, description, mcus, notes, left_out })
+        Ok(Own { config, sim, description, mcus, notes, in_phase, left_out })
     }
 
     /// Whether klippy's copy is without something of the user's.
@@ -236,8 +240,9 @@ impl Folder {
             }
             changes.push(elsewhere("save_variables", "filename", &variables));
         }
-        // That phase is the real endstop's. The simulated one has another.
-        let phases = own.config.of_kind("endstop_phase").map(|section| Change {
+        // A motor that turns with others, or homes without a switch, has other phases than the real one.
+        let has_phase = |section: &&Section| section.own_name().is_some_and(|stepper| own.in_phase.contains(stepper));
+        let phases = own.config.of_kind("endstop_phase").filter(|section| !has_phase(section)).map(|section| Change {
             section: section.name.clone(),
             without: vec!["trigger_phase".into()],
             ..Change::default()

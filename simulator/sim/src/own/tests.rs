@@ -251,6 +251,21 @@ fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
 }
 
 #[test]
+fn a_motor_meets_its_endstop_in_the_phase_that_is_saved() {
+    let steps = |phase: &str| {
+        let text = format!("{PRINTER}[endstop_phase stepper_x]\ntrigger_phase: {phase}\n");
+        let Translated { description, in_phase, .. } = translated(&text).unwrap();
+        assert_eq!(in_phase.into_iter().collect::<Vec<_>>(), ["stepper_x"]);
+        let x = named(&description, "axis", "name", "x");
+        let [from, to, steps_per_mm] = ["start_mm", "endstop_mm", "steps_per_mm"].map(|key| x[key].as_float().unwrap());
+        let steps = (to - from) * steps_per_mm;
+        assert!((steps - steps.round()).abs() < 1e-6 && (to - from).abs() > 5.0, "{steps}");
+        (steps.round() as i64).rem_euclid(64)
+    };
+    assert_eq!(["0/64", "7/64", "63/64", "5/16"].map(steps), [0, 7, 63, 20]);
+}
+
+#[test]
 fn a_chip_without_a_select_pin_is_on_the_bus_of_its_mcu() {
     let text = format!("{PRINTER}[adxl345]\ncs_pin: tool:None\nspi_bus: spidev2.0\n");
     let Translated { description, .. } = translated(&text).unwrap();

@@ -28,6 +28,8 @@ pub(crate) struct Translated {
     pub(crate) pins: Pins,
     /// Notes for the user: sections that are not simulated, and sections that klippy will refuse.
     pub(crate) notes: Vec<Trouble>,
+    /// The steppers whose endstops have the phases that are saved for them.
+    pub(crate) in_phase: BTreeSet<String>,
 }
 
 /// Checks a configuration where no klippy can be asked.
@@ -55,8 +57,8 @@ pub(super) fn translate(config: &Config, pace: Pace, left_out: &LeftOut) -> Resu
     translator.strips()?;
     translator.strangers();
     let pins = translator.boards();
-    let Translator { out, mcus, notes, .. } = translator;
-    Ok(Translated { description: out.into_table(), mcus, pins, notes })
+    let Translator { out, mcus, notes, in_phase, .. } = translator;
+    Ok(Translated { description: out.into_table(), mcus, pins, notes, in_phase })
 }
 
 impl Translator<'_> {

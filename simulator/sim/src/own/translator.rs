@@ -53,6 +53,8 @@ pub(super) struct Translator<'a> {
     enables: BTreeSet<String>,
     /// The axes by the names of their steppers in klippy.
     pub(super) axes: HashMap<String, String>,
+    /// The steppers whose endstops have the phases that are saved for them.
+    pub(super) in_phase: BTreeSet<String>,
     /// The heaters by their names in klippy.
     pub(super) heaters: HashMap<String, String>,
     pub(super) out: Description,
@@ -71,6 +73,7 @@ impl<'a> Translator<'a> {
             enables: BTreeSet::new(),
             axes: HashMap::new(),
             heaters: HashMap::new(),
+            in_phase: BTreeSet::new(),
             out: Description::default(),
             notes: Vec::new(),
             pace,

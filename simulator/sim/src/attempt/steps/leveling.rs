@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Leveling with a probe, and the calibration of the probe.
 
-
 use pinion_printer_config::Limit;
 
 use super::{Seen, skipped};
