@@ -23,8 +23,9 @@ use super::translate::{Translated, check, translate};
 use super::translator::{Pace, Pins};
 use crate::boards::links_of;
 
-/// The ways to an MCU in its section.
-const WAYS: [&str; 5] = ["serial", "canbus_uuid", "canbus_interface", "baud", "restart_method"];
+/// The ways to an MCU in its section. Kalico opens the way to an MCU that is not critical as a serial port, to see whether
+/// it is there. A simulated one always is.
+const WAYS: [&str; 6] = ["serial", "canbus_uuid", "canbus_interface", "baud", "restart_method", "is_non_critical"];
 /// The temperature of the printer's computer, as the kernel writes it.
 const HOST_TEMPERATURE: &str = "45000\n";
 /// Longest file of saved variables.
