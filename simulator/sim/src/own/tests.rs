@@ -212,7 +212,7 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     assert_eq!(boards[0]["pins"].as_array().unwrap(), &["PD1".into()]);
     assert_eq!(notes.len(), 1);
     let line = PRINTER.lines().count() + 1;
-    let words = "is no section of Klipper or Kalico: klippy needs its module, or give --without-plugins; its pins exist, \
+    let words = "is not a section of Klipper or Kalico: klippy needs its module, or give --without-plugins; its pins exist, \
                  and nothing is at them";
     let note = notes[0].to_string();
     assert!(note.ends_with(&format!("printer.cfg:{line}: [beacon] {words}")), "{note}");
