@@ -190,7 +190,7 @@ fn asked(
             match TEMPERATURES.contains(&degrees) && low & 0x0f == 0 {
                 true => Ok(format!("it measures {degrees:.1} degrees")),
                 false => {
-                    Err(Failure::Wrong(format!("{degrees:.1} degrees is not a value of this chip: it is another one")))
+                    Err(Failure::Wrong(format!("{degrees:.1} degrees is not a value of this chip: it is another chip")))
                 }
             }
         }
