@@ -377,5 +377,5 @@ fn a_thermistor_reads_as_klippy_calculates_it() {
                   temperature3: 200\nresistance3: 100\n";
     let beta = of(&format!("sensor_type: mine\n[thermistor mine]\n{points}"));
     assert_eq!(rows(&beta, "points_celsius_ohm"), [[25.0, 100_000.0]]);
-    assert!((beta["beta_k"].as_float().unwrap() - 5568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
+    assert!((beta["beta_k"].as_float().unwrap() - 5_568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
 }
