@@ -189,7 +189,9 @@ fn asked(
             // None of these chips measures less than 1/16 degree.
             match TEMPERATURES.contains(&degrees) && low & 0x0f == 0 {
                 true => Ok(format!("it measures {degrees:.1} degrees")),
-                false => Err(Failure::Wrong(format!("{degrees:.1} degrees cannot be: this is another chip"))),
+                false => {
+                    Err(Failure::Wrong(format!("{degrees:.1} degrees is not a value of this chip: it is another chip")))
+                }
             }
         }
         Check::Fixed { .. } | Check::W1 | Check::Iio { .. } => Ok("it cannot be asked over I2C: try it out".into()),
@@ -457,7 +459,9 @@ mod tests {
             "it measures 25.5 degrees at address 0x48"
         );
         assert_eq!(asked("lm75", 0, &[(0x4f, &[0xf6, 0])]).unwrap().text, "it measures -10.0 degrees at address 0x4f");
-        assert!(asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees cannot be"));
+        assert!(
+            asked("lm75", 0, &[(0x48, &[0xd7, 0])]).unwrap_err().contains("-41.0 degrees is not a value of this chip")
+        );
         // The example of the SHT3x's data sheet.
         assert_eq!(crc8(0xff, &[0xbe, 0xef]), 0x92);
         assert!(asked("sht", 0, &[(0x44, &[0xbe, 0xef, 0x92])]).is_ok());

@@ -58,7 +58,7 @@ fn a_wrong_file_is_one_line_before_the_printer_starts() {
         (&["--compare", "/nonexistent/part.gcode"], "/nonexistent/part.gcode: No such file"),
         (&["--compare", bad], "bad.gcode:2: `X1.2.3` has no number: correct it"),
         (&["--spi-trace", "/nonexistent/spi"], "/nonexistent/spi cannot be written: "),
-        (&["--compare", gcode, "--within", "0"], "--within 0 is no distance: give millimeters above 0"),
+        (&["--compare", gcode, "--within", "0"], "--within 0 is not a distance: give millimeters above 0"),
     ] {
         let output = output(&[&["sim"], args].concat());
         let said = String::from_utf8(output.stderr).unwrap();

@@ -110,7 +110,7 @@ impl Inventory {
         let parts = [chips, adcs, nodes.join(" "), buses.join(" "), ports.join(" ")];
         let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
         match parts.is_empty() {
-            true => "linux: no GPIO chip, ADC, SPI device, I2C bus or serial port is to be seen".to_owned(),
+            true => "linux: no GPIO chip, ADC, SPI device, I2C bus or serial port was found".to_owned(),
             false => format!("linux: {}", parts.join("; ")),
         }
     }

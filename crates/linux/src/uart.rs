@@ -281,7 +281,7 @@ fn set_rate(port: &File, rate_hz: u32) -> Result<(), Trouble> {
     for rate_hz in [rate_hz].into_iter().chain(STANDARD_RATES_HZ) {
         match sys::set_rate(port, rate_hz) {
             Ok(real_hz) if RATES_HZ.contains(&real_hz) => return Ok(()),
-            Ok(real_hz) => refused = format!("it makes {real_hz} of it"),
+            Ok(real_hz) => refused = format!("the port rounds it to {real_hz}"),
             Err(error) => refused = error.to_string(),
         }
     }
@@ -300,7 +300,7 @@ fn in_use() -> Trouble {
 
 fn no_port(error: impl Into<io::Error>) -> Trouble {
     let error = error.into();
-    Trouble::new(format!("it is not a serial port that works: {error}"))
+    Trouble::new(format!("this is not a working serial port: {error}"))
         .remedy("choose another (pinion pins lists them)")
 }
 
@@ -357,7 +357,7 @@ mod tests {
         }
         for other in ["/dev/null", "/dev/zero"] {
             let said = find_line(Path::new(other)).unwrap_err().to_string();
-            assert!(said.starts_with(&format!("{other}: it is not a serial port that works")), "{said}");
+            assert!(said.starts_with(&format!("{other}: this is not a working serial port")), "{said}");
         }
     }
 
@@ -445,7 +445,7 @@ mod tests {
         let dev = tempfile::tempdir().unwrap();
         fs::write(dev.path().join("ttyS0"), "").unwrap();
         for (name, is_console, said) in [
-            ("ttyS0", false, "ttyS0: it is not a serial port that works"),
+            ("ttyS0", false, "ttyS0: this is not a working serial port"),
             ("ttyS1", false, "ttyS1: it is gone: plug"),
             ("ttyS0", true, "the kernel writes its messages to it: remove its console="),
         ] {

@@ -14,13 +14,12 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use crate::demo::heater::Goal;
-use crate::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, demonstrate};
+use crate::demo::demonstrate;
 use pinion_client::Client;
 use pinion_firmware::time::Ticks;
 use pinion_host::{OneClock, Time};
 use pinion_linux::clock::Monotonic;
-use pinion_model::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
+use pinion_model::{SimBoard, SimConfig, SimProbe, SimWorld, printer_cfg};
 use pinion_printer_config::Trouble;
 use pinion_runtime::wakeup::MarginLimits;
 use pinion_runtime::{Access, Helpers, LinkName, Options, Recording, realtime};
@@ -178,8 +177,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         Ok(camera) => camera,
         Err(error) => return failed(error),
     };
-    let plan = plan(&config);
-    let SimWorld { mut boards, probe } = match SimWorld::new(config, Arc::new(clock)) {
+    let SimWorld { mut boards, probe } = match SimWorld::new(config.clone(), Arc::new(clock)) {
         Ok(world) => world,
         Err(error) => return failed(error),
     };
@@ -232,7 +230,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
             let demo = thread::Builder::new().name("demo".into()).spawn(move || {
                 // The link's thread starts it, and passes its real-time priority on.
                 realtime::leave();
-                show((&args, &symlink), &plan, &probe, (&right, &ended));
+                show((&args, &symlink), &config, &probe, (&right, &ended));
             });
             if let Err(trouble) = pinion_runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
@@ -438,8 +436,13 @@ fn begin(args: &SimArgs, owner: &Arc<Owner>, probe: &SimProbe, right: &Arc<Atomi
 }
 
 /// Shows the printer at work, then ends the program or says how to use it with klippy.
-fn show((args, link): (&SimArgs, &Path), plan: &Plan, probe: &SimProbe, (right, ended): (&AtomicBool, &AtomicBool)) {
-    match demonstration(link, plan, probe) {
+fn show(
+    (args, link): (&SimArgs, &Path),
+    config: &SimConfig,
+    probe: &SimProbe,
+    (right, ended): (&AtomicBool, &AtomicBool),
+) {
+    match demonstration(link, config, probe) {
         Err(_) if ended.load(Ordering::SeqCst) => return,
         Ok(all_right) => right.store(all_right, Ordering::SeqCst),
         Err(error) => log::error!("the demonstration: {error}"),
@@ -458,9 +461,9 @@ fn report_how_to_connect((args, link): (&SimArgs, &Path), end: &str) {
     say("  klippy.py printer.cfg");
 }
 
-fn demonstration(link: &Path, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
+fn demonstration(link: &Path, config: &SimConfig, probe: &SimProbe) -> Result<bool, String> {
     let mut client = Client::connect(link, Duration::from_secs(5)).map_err(|error| error.to_string())?;
-    let report = demonstrate(&mut client, plan, &mut ProgressLines::stdout()).map_err(|error| error.to_string())?;
+    let passed = demonstrate(&mut client, config).map_err(|error| error.to_string())?;
     // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
@@ -473,7 +476,7 @@ fn demonstration(link: &Path, plan: &Plan, probe: &SimProbe) -> Result<bool, Str
         say(format_args!("       the printer's {} is at {:.1} C", heater.name, heater.celsius));
     }
     let lost: u64 = probe.axes().map(|axis| axis.lost_steps).sum();
-    let all_right = report.passed() && lost == 0;
+    let all_right = passed && lost == 0;
     say(if all_right { "all of it was right" } else { "NOT all of it was right" });
     Ok(all_right)
 }
@@ -485,69 +488,5 @@ fn say(line: impl Display) {
     page.line(line);
     if let Err(error) = print(&page) {
         log::warn!("{error}");
-    }
-}
-
-/// The plan of a demonstration with this printer.
-fn plan(config: &SimConfig) -> Plan {
-    Plan {
-        axes: config.axes.iter().filter(|axis| !config.is_on_belts(&axis.name)).filter_map(axis).collect(),
-        heater: config.heaters.iter().find(|heater| heater.name == "heater_bed").and_then(heater),
-    }
-}
-
-fn pin(name: &PinName) -> NamedPin {
-    NamedPin { name: name.name.clone(), invert: name.inverted }
-}
-
-/// The plan for an axis. `None` if it cannot be homed.
-fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
-    let travel_mm = axis.travel_mm?;
-    Some(AxisPlan {
-        name: axis.name.clone(),
-        step: pin(&axis.step_pin),
-        dir: pin(&axis.dir_pin),
-        enable: axis.enable_pin.as_ref().map(pin),
-        endstop: pin(axis.endstop_pin.as_ref()?),
-        endstop_pull: 0,
-        steps_per_mm: axis.steps_per_mm,
-        both_edges: axis.step_both_edges,
-        pulse_us: 2.0,
-        travel_mm,
-        start_mm: Some(match axis.endstop_at {
-            End::Min => axis.start_mm,
-            End::Max => travel_mm - axis.start_mm,
-        }),
-        home_positive: axis.endstop_at == End::Max,
-        speed_mm_s: axis.homing_mm_per_s,
-        acceleration_mm_s2: 20.0 * axis.homing_mm_per_s,
-        retract_mm: 5.0,
-    })
-}
-
-/// The plan for a heater. `None` if nothing heats it.
-fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
-    Some(HeaterPlan {
-        name: heater.name.clone(),
-        heater: pin(heater.pin.as_ref()?),
-        sensor: heater.sensor_pin.as_ref()?.name.clone(),
-        thermistor: heater.thermistor().ok()?,
-        min_c: heater.min_celsius,
-        max_c: heater.max_celsius,
-        // The built-in bed takes half a minute to get there.
-        goal: Goal { target_c: heater.ambient_celsius + 20.0, tolerance_c: 1.0, hold_s: 3.0, timeout_s: 180.0 },
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_plan_has_every_axis_with_an_endstop_and_the_bed() {
-        let plan = plan(&SimConfig::default_printer());
-        let names: Vec<&str> = plan.axes.iter().map(|axis| axis.name.as_str()).collect();
-        assert_eq!(names, ["x", "y", "z"]);
-        assert_eq!(plan.heater.map(|heater| heater.name), Some("heater_bed".into()));
     }
 }

@@ -69,7 +69,7 @@ impl Files {
             None => None,
         };
         if !(args.within.is_finite() && args.within > 0.0) {
-            return Err(format!("--within {} is no distance: give millimeters above 0", args.within));
+            return Err(format!("--within {} is not a distance: give millimeters above 0", args.within));
         }
         let toolpath = match args.toolpath.as_deref() {
             Some(path) => Some((Output::check(path, inputs)?, form(path)?)),

@@ -284,7 +284,7 @@ mod tests {
         );
         assert_eq!(
             error("mode = \"0999\""),
-            "f.toml:1:8: mode: an octal number up to 0777 is needed, such as 0660: write it such as mode = \"0660\""
+            "f.toml:1:8: mode: this is not an octal number up to 0777: write it such as mode = \"0660\""
         );
         assert!(error("board = \"toaster\"").contains("f.toml:1:9: board: there are the boards linux, sim"));
         assert!(error("dialect = \"v0.10\"").contains("f.toml:1:11: dialect: there are the dialects "));

@@ -245,7 +245,7 @@ impl Given {
 pub fn mode(text: &str) -> Result<u32, String> {
     match u32::from_str_radix(text, 8) {
         Ok(mode) if mode <= 0o777 => Ok(mode),
-        _ => Err("an octal number up to 0777 is needed, such as 0660".into()),
+        _ => Err("this is not an octal number up to 0777".into()),
     }
 }
 

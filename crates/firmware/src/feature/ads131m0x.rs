@@ -187,7 +187,9 @@ const CONFIG_ADS131M0X: Command = command!(
         if !(2..=CHANNELS_MAX as u8).contains(&num_channels) || channel >= num_channels {
             return Err(Shutdown::by_host(
                 INVALID_CHANNELS,
-                format_args!("channel {channel} of {num_channels} is not one of a chip that has 2 to {CHANNELS_MAX}"),
+                format_args!(
+                    "the host asks for channel {channel} of {num_channels}, but a chip has 2 to {CHANNELS_MAX} channels"
+                ),
             ));
         }
         let chip = Ads131m0x { spi: spi_oid, channels: Channels::One(channel), was_reset: false };

@@ -82,7 +82,7 @@ impl BytesPerReport {
         if usize::from(bytes) > REPORT_BYTES {
             return Err(Shutdown::by_host(
                 INVALID_BYTES_PER_REPORT,
-                format_args!("{bytes} bytes are asked for, but a report has {REPORT_BYTES}"),
+                format_args!("the host asks for {bytes} bytes, but a report has {REPORT_BYTES}"),
             ));
         }
         Ok(BytesPerReport(bytes))

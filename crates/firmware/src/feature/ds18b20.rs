@@ -100,7 +100,7 @@ impl Ds18b20 {
         context.try_shut_down(Shutdown::because(
             OUT_OF_RANGE,
             format!(
-                "it read {} C where {} C to {} C is allowed: what it watches is past its limits, or the sensor is broken (85 C is what it says when its supply just came back)",
+                "it read {} C where {} C to {} C is allowed: the watched part is past its limits, or the sensor is broken (a sensor that has just got its supply back reads 85 C)",
                 celsius(self.value),
                 celsius(self.min_value),
                 celsius(self.max_value)
@@ -127,7 +127,7 @@ impl Object for Ds18b20 {
         } else if at.since(self.asked) > READ_LIMIT {
             context.try_shut_down(Shutdown::because(
                 TOO_SLOW,
-                Trouble::new("its reading has taken more than 5 s")
+                Trouble::new("the reading has taken more than 5 s")
                     .remedy("look at the kernel's log (dmesg), or connect fewer sensors to one wire"),
             ))?;
         }
@@ -185,7 +185,7 @@ fn configure(
     if serial.contains(&b'/') {
         let serial = String::from_utf8_lossy(serial);
         let remedy = "serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab";
-        return Err(Shutdown::because(INVALID_SERIAL, format!("{serial:?} is no sensor")).remedy(remedy));
+        return Err(Shutdown::because(INVALID_SERIAL, format!("{serial:?} is not a sensor")).remedy(remedy));
     }
     let thermometer = context.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {

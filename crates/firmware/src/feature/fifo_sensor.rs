@@ -487,7 +487,7 @@ impl<C: FifoChip> FifoSensor<C> {
 /// Commands wait for each other, so this happens only if the MCU was stopped during a status.
 #[cold]
 fn status_amid_status() -> Shutdown {
-    Shutdown::by_host(reason::WORKER_OVERFLOW, "a status was asked for amid another one")
+    Shutdown::by_host(reason::WORKER_OVERFLOW, "the host asks for a status during another one")
 }
 
 impl<C: FifoChip> Object for FifoSensor<C> {

@@ -459,7 +459,7 @@ const I2C_MODIFY_BITS: Command = command!(
     I2c,
     |i2c, context, reg: &[u8], clear_set_bits: &[u8]| {
         if clear_set_bits.len() % 2 != 0 {
-            let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
+            let what = format_args!("the host sends {} bytes to clear and set", clear_set_bits.len());
             return Err(Shutdown::by_host(ODD_BITS, what));
         }
 

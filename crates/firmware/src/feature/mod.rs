@@ -124,5 +124,5 @@ fn changes_too_late(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
 #[cold]
 fn set_too_late(context: &Context, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
     let name = context.name(pin);
-    Shutdown::by_host(reason, format_args!("{command} wants {name} after finalize_config, and did not set it before"))
+    Shutdown::by_host(reason, format_args!("{command} sets {name} after finalize_config, but must set it before"))
 }

@@ -188,7 +188,7 @@ impl Chips {
                 let present = self.chips[chip].cycle;
                 if present != cycle {
                     let cause = format!(
-                        "the chip at i2c.{bus} address {address:#04x} has a cycle of {} ticks, and one of {} is asked for",
+                        "the chip at i2c.{bus} address {address:#04x} has a cycle of {} ticks, but the host asks for {}",
                         present.0, cycle.0
                     );
                     return Err(Shutdown::because(OTHER_CYCLE, cause).remedy("give its channels the same cycle_time"));

@@ -166,7 +166,7 @@ impl Spi {
             return Err(invalid(format_args!("mode {mode} is outside 0 to 3")));
         }
         if self.bus.is_some() {
-            return Err(invalid("it already has a bus"));
+            return Err(invalid("the device already has a bus"));
         }
         // Klipper's C opens a bus even then. Here the core would have to wait for the files, and steps with it.
         if context.is_finalized() {
@@ -218,7 +218,10 @@ impl Spi {
         let slot = &mut self.transfers[self.next];
         // It is here, unless a bus has been hanging since before a stop.
         let Some(transfer) = slot.here() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
+            return Err(Shutdown::by_host(
+                reason::WORKER_OVERFLOW,
+                "the messages from before the stop are still being sent",
+            ));
         };
         if let Some((round, number)) = &mut transfer.round {
             *number = round.number();

@@ -186,7 +186,7 @@ impl Stepper {
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
             let cause = format!(
-                "a step is {} us late: the host asks for more steps a second than the step pulse and this computer allow",
+                "a step is {} us late: the host asks for more steps per second than the step pulse and this computer allow",
                 early / i64::from(Ticks::from_us(1).0)
             );
             return Err(Shutdown::because(STEPPER_PAST, cause)

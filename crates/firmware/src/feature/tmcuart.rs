@@ -143,7 +143,10 @@ impl TmcUart {
         if write.len() > DATA_MAX || read_len > DATA_MAX {
             return Err(Shutdown::by_host(
                 DATA_TOO_LARGE,
-                format_args!("tmcuart_send wants {} bytes sent and {read_len} read, of {DATA_MAX} each", write.len()),
+                format_args!(
+                    "tmcuart_send sends {} bytes and reads {read_len}, but at most {DATA_MAX} each are possible",
+                    write.len()
+                ),
             ));
         }
         let message = &mut exchange.message;

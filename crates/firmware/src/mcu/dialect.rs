@@ -17,7 +17,7 @@ use super::forms::{Entry, Item, Part, entries};
 use super::{DialectName, Forms, Wire, base};
 
 /// The remedy for a host with another dictionary.
-pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary again";
+pub(super) const READ_ANEW: &str = "restart the host: it then reads the dictionary again";
 
 /// A command of the dialect, found by its id.
 pub(super) struct Known {
@@ -33,7 +33,7 @@ pub(super) struct Known {
 impl Known {
     fn new(command: &Command, is_own: bool) -> io::Result<Known> {
         let conversions = format::parameters(command.format)
-            .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
+            .ok_or_else(|| io::Error::other(format!("\"{}\" is not a format", command.format)))?;
         Ok(Known {
             format: command.format,
             handler: command.handler,

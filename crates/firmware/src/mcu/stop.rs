@@ -161,7 +161,7 @@ impl State {
             if now.since(value.since) >= i64::from(UNGUARDED_LIMIT.0) {
                 value.given_up = true;
                 let cause = format!(
-                    "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
+                    "{} has not accepted its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
                     value.name,
                     UNGUARDED_LIMIT.as_ms()
                 );

@@ -61,7 +61,7 @@ impl FromStr for Limit {
     fn from_str(text: &str) -> Result<Limit, String> {
         let seconds = text.strip_suffix('s').and_then(|seconds| seconds.parse().ok());
         let seconds = seconds.filter(|seconds| (1..=SECONDS_MAX).contains(seconds));
-        seconds.map(Limit).ok_or_else(|| format!("a time from 1s to {SECONDS_MAX}s is wanted"))
+        seconds.map(Limit).ok_or_else(|| format!("give a time from 1s to {SECONDS_MAX}s"))
     }
 }
 

@@ -224,7 +224,7 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     rig.run_until(now + 30_000_000);
     assert_eq!(rig.mcu.pending_value(), None);
     let notes = rig.notes();
-    let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not taken its shutdown values for 500 ms"));
+    let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not accepted its shutdown values for 500 ms"));
     assert_eq!(given_up.count(), 1, "{notes:?}");
 
     // It is still retried, and reported when it works.

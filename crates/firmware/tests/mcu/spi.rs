@@ -93,7 +93,7 @@ fn a_message_that_can_not_be_sent_keeps_no_one_from_the_next_configuration() {
     assert!(rig.mcu.is_held() && rig.mcu.has_pending_values());
     rig.run_until(30_000_000);
     assert!(!rig.mcu.is_held());
-    assert!(rig.notes().iter().any(|note| note.contains("SPI shutdown message oid 1 has not taken")));
+    assert!(rig.notes().iter().any(|note| note.contains("SPI shutdown message oid 1 has not accepted")));
     rig.forget_responses();
     rig.configure(&[]);
 }

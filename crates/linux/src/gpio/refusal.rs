@@ -96,7 +96,7 @@ impl Subject {
                 Trouble::new(format!("{self} cannot be {action}: {}: the chip {label} does not offer it", text(code)))
                     .remedy("choose another pin")
             }
-            _ => Trouble::new(format!("{self} cannot be used as {action}: {}", text(code)))
+            _ => Trouble::new(format!("the kernel refuses {self} as {action}: {}", text(code)))
                 .remedy("look at the kernel's log (dmesg), or choose another pin"),
         }
     }

@@ -104,7 +104,7 @@ impl Thermistor {
     }
 
     /// The voltage at the ADC as a fraction of its reference.
-    pub(crate) fn fraction(&self, celsius: f64) -> f64 {
+    pub fn fraction(&self, celsius: f64) -> f64 {
         // The logistic function of ln(R / pull-up): R / (pull-up + R) without an overflow.
         1.0 / (1.0 + (self.pullup_ohm.ln() - self.ln_ohm(celsius)).exp())
     }

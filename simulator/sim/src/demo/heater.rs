@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use pinion_client::config::Config;
 use pinion_client::{Client, Error, Params};
+use pinion_model::{HeaterConfig, PinName, Thermistor};
 use pinion_protocol::clock::Clock;
 
 /// The output's period, in seconds.
@@ -22,81 +23,63 @@ const LEAD_S: f64 = 0.25;
 /// How long to wait for a reading.
 const READING_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// A heater's pins and limits.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Wiring {
-    /// The output's pin.
-    pub heater_pin: String,
-    /// Whether the output is low when it heats.
-    pub invert: bool,
-    /// The sensor's pin.
-    pub sensor_pin: String,
-    /// The MCU shuts down below this, in degrees Celsius.
-    pub min_c: f64,
-    /// The MCU shuts down above this, in degrees Celsius.
-    pub max_c: f64,
-}
-
-/// A reading, and the output that follows from it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reading {
-    /// When the samples began.
-    pub clock: Clock,
-    /// Degrees Celsius.
-    pub celsius: f64,
-    /// The output from then on, 0 to 1.
-    pub power: f64,
-}
+/// How far above its surroundings the heater heats. The built-in bed takes half a minute to get there.
+const RISE_C: f64 = 20.0;
+/// How far off the temperature may be.
+pub const TOLERANCE_C: f64 = 1.0;
+/// How long it must stay within the tolerance, in seconds.
+pub const HOLD_S: f64 = 3.0;
+/// When to give up.
+const TIMEOUT: Duration = Duration::from_secs(180);
 
 /// A heater as configured.
-pub struct Heater {
+pub struct Heater<'a> {
+    heater: &'a HeaterConfig,
+    pin: &'a PinName,
+    sensor_pin: &'a PinName,
+    thermistor: Thermistor,
     sensor: u8,
     output: u8,
-    wiring: Wiring,
-    celsius: Box<dyn Fn(f64) -> f64>,
     last: Option<Clock>,
 }
 
-/// The goal of a heater.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Goal {
-    /// Degrees Celsius.
-    pub target_c: f64,
-    /// How far off the temperature may be, in degrees.
-    pub tolerance_c: f64,
-    /// How long it must stay within the tolerance, in seconds.
-    pub hold_s: f64,
-    /// When to give up, in seconds.
-    pub timeout_s: f64,
-}
-
-impl Heater {
-    /// Adds a heater to a configuration. `celsius` converts a reading, as a part of the full scale, to degrees. The
-    /// degrees must fall as the reading rises. Fails if there are too many objects.
+impl<'a> Heater<'a> {
+    /// Adds a heater to a configuration. `None` if nothing heats it, or if its sensor is not a thermistor. Fails if there
+    /// are too many objects.
     pub fn configure(
         client: &Client,
         config: &mut Config,
-        wiring: Wiring,
-        celsius: Box<dyn Fn(f64) -> f64>,
-    ) -> Result<Heater, Error> {
-        let (sensor, output) = (config.oid()?, config.oid()?);
-        let off = u8::from(wiring.invert);
-        config.add(format!("config_analog_in oid={sensor} pin={}", wiring.sensor_pin));
-        config.add(format!(
-            "config_digital_out oid={output} pin={} value={off} default_value={off} \
-             max_duration={}",
-            wiring.heater_pin,
-            client.ticks(MAX_DURATION_S)
-        ));
-        config.add(format!("set_digital_out_pwm_cycle oid={output} cycle_ticks={}", client.ticks(CYCLE_S)));
-        Ok(Heater { sensor, output, wiring, celsius, last: None })
+        heater: &'a HeaterConfig,
+    ) -> Option<Result<Heater<'a>, Error>> {
+        let (pin, sensor_pin) = (heater.pin.as_ref()?, heater.sensor_pin.as_ref()?);
+        let thermistor = heater.thermistor().ok()?;
+        let oids = config.oid().and_then(|sensor| Ok((sensor, config.oid()?)));
+        Some(oids.map(|(sensor, output)| {
+            let (off, name, max) = (u8::from(pin.inverted), &pin.name, client.ticks(MAX_DURATION_S));
+            config.add(format!("config_analog_in oid={sensor} pin={}", sensor_pin.name));
+            config.add(format!(
+                "config_digital_out oid={output} pin={name} value={off} default_value={off} max_duration={max}"
+            ));
+            config.add(format!("set_digital_out_pwm_cycle oid={output} cycle_ticks={}", client.ticks(CYCLE_S)));
+            Heater { heater, pin, sensor_pin, thermistor, sensor, output, last: None }
+        }))
     }
 
-    /// Heats until the goal is reached and held. Then it switches off and returns the last reading. Fails if the goal
-    /// is not reached in time.
-    pub fn heat(&mut self, client: &mut Client, goal: Goal, seen: &mut dyn FnMut(Reading)) -> Result<Reading, Error> {
+    /// Its name for people.
+    pub fn name(&self) -> &str {
+        &self.heater.name
+    }
+
+    /// The temperature to reach.
+    pub fn target_c(&self) -> f64 {
+        self.heater.ambient_celsius + RISE_C
+    }
+
+    /// Heats until the target is reached and held. Then it switches off and returns the last temperature. `seen` gets each
+    /// temperature and the power that follows from it, 0 to 1. Fails if the target is not reached in time.
+    pub fn heat(&mut self, client: &mut Client, seen: &mut dyn FnMut(f64, f64)) -> Result<f64, Error> {
         self.query(client, SAMPLES)?;
-        let result = self.pursue(client, goal, seen);
+        let result = self.pursue(client, seen);
         // After a shutdown the output is off, and the error to return is the shutdown's.
         if client.check().is_ok() {
             self.set(client, 0.0)?;
@@ -106,31 +89,30 @@ impl Heater {
         result
     }
 
-    fn pursue(&mut self, client: &mut Client, goal: Goal, seen: &mut dyn FnMut(Reading)) -> Result<Reading, Error> {
-        let until = Instant::now() + seconds(goal.timeout_s);
+    fn pursue(&mut self, client: &mut Client, seen: &mut dyn FnMut(f64, f64)) -> Result<f64, Error> {
+        let until = Instant::now() + TIMEOUT;
+        let target_c = self.target_c();
         let mut control = Control::default();
         let mut there_since: Option<Clock> = None;
         loop {
             let (clock, celsius) = self.read(client)?;
-            let power = control.power(goal.target_c - celsius, REPORT_S);
+            let power = control.power(target_c - celsius, REPORT_S);
             self.set(client, power)?;
-            let reading = Reading { clock, celsius, power };
-            seen(reading);
-            if (celsius - goal.target_c).abs() <= goal.tolerance_c {
+            seen(celsius, power);
+            if (celsius - target_c).abs() <= TOLERANCE_C {
                 let since = *there_since.get_or_insert(clock);
-                if clock.since(since) as f64 >= goal.hold_s * client.frequency_hz() {
-                    return Ok(reading);
+                if clock.since(since) as f64 >= HOLD_S * client.frequency_hz() {
+                    return Ok(celsius);
                 }
             } else {
                 there_since = None;
             }
             if Instant::now() >= until {
                 return Err(Error::Plan {
-                    subject: self.wiring.heater_pin.clone(),
+                    subject: self.pin.name.clone(),
                     why: format!(
-                        "{celsius:.1} °C after {:.0} s instead of {:.1} °C; check heater and \
-                         sensor, or give it more time",
-                        goal.timeout_s, goal.target_c
+                        "{celsius:.1} °C after {} s instead of {target_c:.1} °C; check heater and sensor, or give it more time",
+                        TIMEOUT.as_secs()
                     ),
                 });
             }
@@ -140,15 +122,15 @@ impl Heater {
     /// Starts readings, or stops them with no samples.
     fn query(&self, client: &mut Client, samples: u8) -> Result<(), Error> {
         let full = client.constant("ADC_MAX")? * f64::from(SAMPLES);
-        let limit = |celsius: f64| self.fraction(celsius) * full;
+        let limit = |celsius: f64| self.thermistor.fraction(celsius) * full;
         let mut args = vec![
             ("oid", self.sensor.into()),
             ("clock", client.clock_in(LEAD_S)?.into()),
             ("sample_ticks", client.ticks(SAMPLE_S).into()),
             ("sample_count", samples.into()),
             ("rest_ticks", client.ticks(REPORT_S).into()),
-            ("min_value", (limit(self.wiring.max_c).floor() as i64).into()),
-            ("max_value", (limit(self.wiring.min_c).ceil() as i64).into()),
+            ("min_value", (limit(self.heater.max_celsius).floor() as i64).into()),
+            ("max_value", (limit(self.heater.min_celsius).ceil() as i64).into()),
             ("range_check_count", RANGE_CHECKS.into()),
         ];
         if client.messages().has_parameter("query_analog_in", "bytes_per_report") {
@@ -160,11 +142,11 @@ impl Heater {
     fn read(&self, client: &mut Client) -> Result<(Clock, f64), Error> {
         let until = Instant::now() + READING_TIMEOUT;
         let state = client.wait("analog_in_state", Some(self.sensor), until)?.ok_or_else(|| Error::Timeout {
-            waiting_for: format!("reading of {}", self.wiring.sensor_pin),
+            waiting_for: format!("reading of {}", self.sensor_pin.name),
             after: READING_TIMEOUT,
         })?;
         let full = client.constant("ADC_MAX")? * f64::from(SAMPLES);
-        let celsius = (self.celsius)(value(&state)? / full);
+        let celsius = self.thermistor.celsius(value(&state)? / full);
         let next = client.widen(state.u32("next_clock")?);
         let clock = next.displaced(client.ticks(REPORT_S).wrapping_neg());
         Ok((clock, celsius))
@@ -172,7 +154,7 @@ impl Heater {
 
     fn set(&mut self, client: &mut Client, power: f64) -> Result<(), Error> {
         let cycle = client.ticks(CYCLE_S);
-        let part = if self.wiring.invert { 1.0 - power } else { power };
+        let part = if self.pin.inverted { 1.0 - power } else { power };
         let on_ticks = (part.clamp(0.0, 1.0) * f64::from(cycle)).round() as u32;
         // Each value must take effect after the one before.
         let clock = client.clock_in(LEAD_S)?;
@@ -182,20 +164,6 @@ impl Heater {
             "queue_digital_out",
             &[("oid", self.output.into()), ("clock", clock.into()), ("on_ticks", on_ticks.into())],
         )
-    }
-
-    /// The reading at a temperature, as a part of the full scale, by bisection.
-    fn fraction(&self, celsius: f64) -> f64 {
-        let (mut low, mut high) = (0.0, 1.0);
-        for _ in 0..32 {
-            let middle = (low + high) / 2.0;
-            if (self.celsius)(middle) > celsius {
-                low = middle;
-            } else {
-                high = middle;
-            }
-        }
-        low
     }
 }
 
@@ -208,10 +176,6 @@ fn value(state: &Params) -> Result<f64, Error> {
         [low, high, ..] => Ok(f64::from(u16::from_le_bytes([*low, *high]))),
         _ => Err(Error::Message { message: state.name.clone(), why: "the report has no value".to_owned() }),
     }
-}
-
-fn seconds(span: f64) -> Duration {
-    Duration::try_from_secs_f64(span).unwrap_or(Duration::MAX / 4)
 }
 
 /// A proportional-integral controller. Far below the target it gives full power. Near the target the power is in

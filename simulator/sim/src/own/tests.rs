@@ -212,7 +212,7 @@ fn everything_else_becomes_what_it_is_and_each_pin_exists() {
     assert_eq!(boards[0]["pins"].as_array().unwrap(), &["PD1".into()]);
     assert_eq!(notes.len(), 1);
     let line = PRINTER.lines().count() + 1;
-    let words = "is no section of Klipper or Kalico: klippy needs its module, or give --without-plugins; its pins exist, \
+    let words = "is not a section of Klipper or Kalico: klippy needs its module, or give --without-plugins; its pins exist, \
                  and nothing is at them";
     let note = notes[0].to_string();
     assert!(note.ends_with(&format!("printer.cfg:{line}: [beacon] {words}")), "{note}");
@@ -392,5 +392,5 @@ fn a_thermistor_reads_as_klippy_calculates_it() {
                   temperature3: 200\nresistance3: 100\n";
     let beta = of(&format!("sensor_type: mine\n[thermistor mine]\n{points}"));
     assert_eq!(rows(&beta, "points_celsius_ohm"), [[25.0, 100_000.0]]);
-    assert!((beta["beta_k"].as_float().unwrap() - 5568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
+    assert!((beta["beta_k"].as_float().unwrap() - 5_568.427_285).abs() < 1e-6, "{}", beta["beta_k"]);
 }

@@ -95,7 +95,7 @@ impl Translator<'_> {
                 Kind::Strange => {
                     let remedy =
                         "klippy needs its module, or give --without-plugins; its pins exist, and nothing is at them";
-                    self.note(section, "is no section of Klipper or Kalico", remedy);
+                    self.note(section, "is not a section of Klipper or Kalico", remedy);
                 }
             }
         }

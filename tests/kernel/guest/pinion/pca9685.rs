@@ -55,7 +55,7 @@ fn a_silent_chip_neither_ends_the_program_nor_keeps_it_from_the_next_configurati
     let silent = format!("{} 1000000", Errno::ENXIO as i32);
     let silent = sysfs::set(format!("{MOCK}/fail"), silent, "0 0");
     run(client, "emergency_stop");
-    program.wait_for_line(&["PCA9685 has not taken its shutdown values for 500 ms", "its outputs may be on"]);
+    program.wait_for_line(&["PCA9685 has not accepted its shutdown values for 500 ms", "its outputs may be on"]);
     // The guardian ends a program that owes an output for a second.
     thread::sleep(Duration::from_secs(3));
     assert!(program.is_running(), "{}", program.log());
