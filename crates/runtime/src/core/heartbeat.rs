@@ -100,11 +100,10 @@ impl Heartbeat {
             return None;
         }
         let trouble = match suspended_ms {
-            0 => Trouble::new(format!("Pinion stood still for {ms} ms")).remedy(
-                "was it stopped, its control group frozen, or the computer paused? FIRMWARE_RESTART starts anew",
-            ),
+            0 => Trouble::new(format!("Pinion stood still for {ms} ms"))
+                .remedy("was it stopped, its control group frozen, or the computer paused? Then FIRMWARE_RESTART"),
             _ => Trouble::new(format!("the computer was suspended for {suspended_ms} ms with outputs in use"))
-                .remedy("keep it from that (systemctl mask sleep.target); FIRMWARE_RESTART starts anew"),
+                .remedy("keep it from that (systemctl mask sleep.target), then FIRMWARE_RESTART"),
         };
         Some(Shutdown::because(reason::TIMER_PAST, trouble))
     }

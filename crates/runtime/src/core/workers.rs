@@ -124,7 +124,7 @@ fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
 }
 
 fn no_worker() -> Shutdown {
-    overflow("a bus", Trouble::new("it is not there").remedy(REPORT))
+    overflow("a bus", Trouble::new("the device does not exist").remedy(REPORT))
 }
 
 impl Workers for Threads {
@@ -159,7 +159,7 @@ impl Workers for Threads {
             return Err((job, no_worker()));
         };
         if let Err(PushError::Full(Message::Job(job, _))) = worker.jobs.push(Message::Job(job, self.clock.now())) {
-            let trouble = Trouble::new("more is asked of it at once than there are devices");
+            let trouble = Trouble::new("more jobs than devices are queued on it");
             let why = overflow(&worker.bus, trouble.remedy(REPORT));
             return Err((job, why));
         }

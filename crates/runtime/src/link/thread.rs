@@ -292,7 +292,7 @@ impl LinkThread {
     fn lose_guardian(&mut self, why: &str) {
         let cause = format!("{why}, and without it a crash would leave heaters on");
         let stop = Shutdown::because(reason::GUARDIAN_LOST, cause);
-        self.request(Request::Shutdown(stop.remedy("Pinion ends, to be started anew with one")));
+        self.request(Request::Shutdown(stop.remedy("Pinion ends, so that its service restarts it with one")));
         self.oversight.lose_guardian();
     }
 
@@ -320,7 +320,7 @@ impl LinkThread {
         if read.is_forced {
             self.handshake.stop();
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
-            self.request(Request::Shutdown(stop.remedy("FIRMWARE_RESTART starts anew")));
+            self.request(Request::Shutdown(stop.remedy("then FIRMWARE_RESTART")));
         }
         Ok(read.is_over)
     }

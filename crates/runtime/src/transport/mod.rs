@@ -156,7 +156,7 @@ impl FromStr for LinkName {
             // A path may contain a comma.
             ("pty", _, _) if !rest.is_empty() => Ok(LinkName::Pty(rest.into())),
             ("serial", port, _) if !port.is_empty() && !port.starts_with('/') => {
-                Err(format!("{port} is no path of a port, such as /dev/ttyAMA0"))
+                Err(format!("{port} is not the path of a port, such as /dev/ttyAMA0"))
             }
             ("serial", port, None) if !port.is_empty() => {
                 let is_gadget =
@@ -166,7 +166,7 @@ impl FromStr for LinkName {
             ("serial", port, Some(baud)) if !port.is_empty() => match baud.parse() {
                 Ok(baud) if baud >= BAUD_MIN => Ok(LinkName::Serial(port.into(), Some(baud))),
                 Ok(baud) => Err(format!("klippy does not accept {baud} baud: name {BAUD_MIN} or more, such as {BAUD}")),
-                Err(_) => Err(format!("{baud} is no rate in baud, such as {BAUD}")),
+                Err(_) => Err(format!("{baud} is not a rate in baud, such as {BAUD}")),
             },
             ("can", interface, uuid) if is_interface(interface) => {
                 Ok(LinkName::Can(interface.into(), uuid.map(str::parse).transpose()?))

@@ -10,8 +10,6 @@ use super::dock::Dock;
 use super::rail::{Motor, Rail};
 use super::seqlock::Seqlock;
 use crate::description::axes::AxisConfig;
-#[cfg(test)]
-use crate::description::rails::RailConfig;
 use pinion_firmware::time::Clock;
 
 /// How far two motors of one rail may be apart. The rail then jams, and a motor that goes on loses its steps. Homing
@@ -61,7 +59,8 @@ impl Axis {
     pub fn new(config: &AxisConfig) -> Axis {
         let motor = Motor::at(config.start_mm, config);
         let step_mm = 1.0 / config.steps_per_mm;
-        let rail = Arc::new(Rail::new(&RailConfig::of(config), vec![(motor.clone(), step_mm)]));
+        let rail =
+            Arc::new(Rail::new(&crate::description::rails::RailConfig::of(config), vec![(motor.clone(), step_mm)]));
         Axis::driving(config, motor, rail.clone(), vec![(rail, step_mm)])
     }
 

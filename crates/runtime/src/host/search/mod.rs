@@ -143,7 +143,7 @@ impl HostFinder {
                     return;
                 }
             }
-            warn!("the search for the host has ended, or sent nonsense, so every host gets the union of v0.13, master and Kalico: restart Pinion when no print runs");
+            warn!("the search for the host has ended or sent invalid data, so every host gets the union of v0.13, master and Kalico: restart Pinion when no print runs");
             drop(sender);
             wake.wake();
         })?;
