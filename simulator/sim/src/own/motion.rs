@@ -212,7 +212,7 @@ impl<'a> Translator<'a> {
         let (Endstop::Switch(_), Some((phase, of))) = (endstop, saved) else { return Ok(start) };
         let (phase, of): (f64, f64) = (phase, of);
         let steps_per_mm = Translator::steps_per_mm(section)?;
-        let phases = 4 * section.whole("microsteps", 1)?.unwrap_or(16) as i64;
+        let phases = 4 * section.whole("microsteps", 1)?.unwrap_or(16);
         // As klippy rounds it (`convert_phase`).
         let wanted = (phase / of * phases as f64 + 0.5) as i64;
         let [from, to] = [start, rail.endstop].map(|mm| (mm * steps_per_mm).round() as i64);
