@@ -14,7 +14,7 @@ use std::time::Duration;
 use nix::sys::signal::{self, Signal};
 use nix::unistd::Pid;
 
-use crate::klippy::await_end;
+use crate::process::await_end;
 
 /// The environment's word that makes Python print them.
 pub(crate) const PRINTS: &str = "PYTHONFAULTHANDLER=1";

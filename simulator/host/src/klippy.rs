@@ -12,8 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI32, Ordering};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nix::fcntl::{FcntlArg, FdFlag, fcntl};
 use nix::sys::signal::{self, Signal};
@@ -24,6 +23,7 @@ use pinion_firmware::trouble::Trouble;
 
 use crate::clock::{self, LIBRARY, Stop};
 use crate::hang::{self, Hang};
+use crate::process::await_end;
 use crate::time::Time;
 
 /// The file of klippy's output in its folder.
@@ -45,8 +45,6 @@ const LOOK: Duration = Duration::from_secs(5);
 const FIRST_MOMENTS: Duration = Duration::from_secs(3);
 /// How long klippy has to end in order, in real time.
 const END_TIME: Duration = Duration::from_secs(3);
-/// Time between two looks at a process that shall end.
-const LOOK_FOR_END: Duration = Duration::from_millis(20);
 /// Time between two looks at an API that is not there yet.
 const LOOK_FOR_API: Duration = Duration::from_millis(50);
 /// Time between two calls of a watch. The printer keeps half a second of an axis at 32,000 steps per second.
@@ -528,14 +526,6 @@ fn await_api(
         if ended || time.now() > until {
             return Err(no_start(folder, ended).into());
         }
-    }
-}
-
-/// Waits for the end of a process, for at most this real time.
-pub(crate) fn await_end(process: &mut Child, span: Duration) {
-    let until = Instant::now() + span;
-    while Instant::now() < until && matches!(process.try_wait(), Ok(None)) {
-        thread::sleep(LOOK_FOR_END);
     }
 }
 

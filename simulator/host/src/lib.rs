@@ -11,6 +11,7 @@ mod clock;
 mod hang;
 mod klippy;
 mod mcu;
+mod process;
 mod time;
 mod workers;
 

@@ -91,7 +91,7 @@ impl Workers for Buses {
         if bus.waiting.len() >= JOBS_MAX {
             return Err((
                 job,
-                Shutdown::because(reason::WORKER_OVERFLOW, "more is asked of a bus than there are devices"),
+                Shutdown::because(reason::WORKER_OVERFLOW, "more jobs than devices are queued on a bus"),
             ));
         }
         bus.waiting.push_back(job);

@@ -62,6 +62,18 @@ fn heater_of<'a>(config: &'a Config, sensor: &Section) -> Option<&'a Section> {
     config.sections().iter().find(is_it)
 }
 
+/// The watts, heat capacity and loss that a calibrated heater's control by a model has (Kalico's `control: mpc`). With
+/// others, the model would find an impossible temperature of the surroundings.
+fn mpc_model(section: &Section) -> Result<Option<[f64; 3]>, Trouble> {
+    if section.text("control") != Some("mpc") {
+        return Ok(None);
+    }
+    let number = |key: &str| section.number(key, Limit::Any).map(|number| number.filter(|number| *number > 0.0));
+    let (watts, j_per_k) = (number("heater_power")?, number("block_heat_capacity")?);
+    let loss = number("ambient_transfer")?;
+    Ok(watts.zip(j_per_k).zip(loss).map(|((watts, j_per_k), loss)| [watts, j_per_k, loss]))
+}
+
 impl Translator<'_> {
     pub(super) fn heat(&mut self) -> Result<(), Trouble> {
         for section in self.config.sections().iter().filter(|section| has_sensor(section.kind())) {
@@ -108,17 +120,12 @@ impl Translator<'_> {
         }
         entry = match &pin {
             Some(pin) => {
-                let rate = self.kelvin_per_second(powered)?;
-                let watts = rate * J_PER_K;
-                // A heater that never gets all of its power has more of it.
-                let share = powered.number("max_power", Limit::Above(0.0))?.unwrap_or(1.0).min(1.0);
-                let real_max = max.min(REAL_MAX_CELSIUS[usize::from(powered.kind() != "heater_bed")]);
-                let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(powered, real_max)?);
-                entry
-                    .set("pin", pin.as_str())
-                    .set("heater_watts", watts / share)
-                    .set("heat_capacity_j_per_k", J_PER_K)
-                    .set("loss_w_per_k", watts / reach)
+                let entry = entry.set("pin", pin.as_str());
+                let [watts, j_per_k, loss] = match mpc_model(powered)? {
+                    Some(model) => model,
+                    None => self.usual_model(powered, max)?,
+                };
+                entry.set("heater_watts", watts).set("heat_capacity_j_per_k", j_per_k).set("loss_w_per_k", loss)
             }
             None => {
                 let loss = J_PER_K / 60.0;
@@ -213,6 +220,16 @@ impl Translator<'_> {
             }
         }
         Ok(())
+    }
+
+    /// The watts, heat capacity and loss of a heater that its section's control can hold.
+    fn usual_model(&self, section: &Section, max: f64) -> Result<[f64; 3], Trouble> {
+        let watts = self.kelvin_per_second(section)? * J_PER_K;
+        // A heater that never gets all of its power has more of it.
+        let share = section.number("max_power", Limit::Above(0.0))?.unwrap_or(1.0).min(1.0);
+        let real_max = max.min(REAL_MAX_CELSIUS[usize::from(section.kind() != "heater_bed")]);
+        let reach = (RESERVE * (real_max - AMBIENT_CELSIUS)).max(50.0).max(self.reach_by_p(section, real_max)?);
+        Ok([watts / share, J_PER_K, watts / reach])
     }
 
     /// How fast full power heats: as fast as the section's control can hold.

@@ -231,6 +231,18 @@ fn a_heater_whose_integral_part_is_slow_holds_its_target_by_its_gain() {
 }
 
 #[test]
+fn a_heater_that_is_controlled_by_a_model_is_as_its_model() {
+    let heater = |capacity: &str| {
+        let control = format!("control: mpc\nheater_power: 120\nambient_transfer: 0.0738\n{capacity}");
+        let Translated { description, .. } = translated(&PRINTER.replacen("control: pid\n", &control, 1)).unwrap();
+        let hot = named(&description, "heater", "name", "extruder");
+        ["heater_watts", "heat_capacity_j_per_k", "loss_w_per_k"].map(|key| hot[key].as_float().unwrap())
+    };
+    assert_eq!(heater("block_heat_capacity: 24.45\n"), [120.0, 24.45, 0.0738]);
+    assert_ne!(heater("")[0], 120.0, "it is not calibrated");
+}
+
+#[test]
 fn motors_of_z_begin_on_a_plane_that_klippy_can_level() {
     let start = |text: &str| -> Vec<f64> {
         let Translated { description, .. } = translated(text).unwrap();

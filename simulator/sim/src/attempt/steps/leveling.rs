@@ -54,8 +54,8 @@ pub(super) fn leveled(trial: &mut Trial<'_>) -> Seen {
     Ok(commands.join(", "))
 }
 
-/// Commands that need the probe of a dock: its macros take it up first and put it back. Those of commands that do so
-/// themselves leave a probe that is locked where it is.
+/// These commands, between the macros that take a probe from its dock and put it back, if the printer has such a probe.
+/// A command whose own macro does that leaves a probe that is locked at the nozzle.
 fn with_probe<'a>(trial: &Trial<'_>, commands: &[&'a str]) -> Vec<&'a str> {
     const TAKE_UP: &str = "ATTACH_PROBE_LOCK";
     const PUT_BACK: &str = "DOCK_PROBE_UNLOCK";
