@@ -1,17 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The document of `pinion latency --json`.
 
-use std::fs;
 use std::path::Path;
 
 use pinion_firmware::lateness::{Lateness, us};
 use pinion_runtime::latency::{Assessment, Fitness, Half};
+use pinion_system::files;
 use serde::{Deserialize, Serialize};
 
 use super::computer_name;
 
 /// The version of the document. Later versions may add keys.
 const FORM: u32 = 1;
+/// Largest document that is read, in MiB.
+const MIB_MAX: u64 = 1;
 
 /// The figures of a computer: its latency, or with `--pin` the cost of an edge.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -69,7 +71,7 @@ pub struct LateUs {
 pub struct EdgeCost {
     pub(super) line: String,
     /// Through the kernel.
-    pub kernel_ns: f64,
+    pub kernel_ns: Option<f64>,
     /// Through the chip's registers, if that is possible.
     pub registers_ns: Option<f64>,
 }
@@ -98,8 +100,8 @@ impl Figures {
     ///
     /// The file cannot be read, or is another document.
     pub fn read(path: &Path) -> Result<Figures, String> {
-        let text = fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
-        serde_json::from_str(&text)
+        let bytes = files::read(path, MIB_MAX).map_err(|error| format!("{}: {error}", path.display()))?;
+        serde_json::from_slice(&bytes)
             .map_err(|error| format!("{}: {error}: name an output of \"pinion latency --json\"", path.display()))
     }
 

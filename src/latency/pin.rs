@@ -32,27 +32,22 @@ struct Cost {
 /// There is no such line, or it is in use.
 pub(super) fn measure(name: &str, wish: FastGpio) -> Result<(String, EdgeCost), String> {
     let line = find(name)?;
-    let mut edge = EdgeCost { line: name.to_owned(), kernel_ns: 0.0, registers_ns: None };
     let mut text = format!("{name}, {} s each way:\n", SPAN.as_secs());
-    for (way, wish) in [("kernel", FastGpio::Off), ("registers", wish)] {
+    let mut way = |way: &str, wish: FastGpio| -> Result<Option<f64>, String> {
         let mut board = LinuxBoard::new(None, wish);
         let output = Direction::Output { level: false, shutdown_value: false };
         let claimed = board.line(line, output).map_err(|stop| stop.to_string())?;
-        let cost = match wish == FastGpio::Off || claimed.line.is_fast() {
-            true => cost(&*claimed.line).map(Some),
-            false => Ok(None),
-        };
+        let is_possible = wish == FastGpio::Off || claimed.line.is_fast();
+        let cost = is_possible.then(|| cost(&*claimed.line)).transpose();
         // A line that nobody uses is an input.
         let _ = claimed.line.set_direction(Direction::Input(Bias::None));
         let cost = cost?;
         let said = cost.as_ref().map_or_else(|| "cannot be used: the line above says why".to_owned(), Cost::to_string);
-        text += &format!("  {way:<9}  {said}\n");
-        match wish {
-            FastGpio::Off => edge.kernel_ns = cost.map_or(0.0, |cost| cost.p50),
-            _ => edge.registers_ns = cost.map(|cost| cost.p50),
-        }
-        text += hidden(&*claimed.line);
-    }
+        text += &format!("  {way:<9}  {said}\n{}", hidden(&*claimed.line));
+        Ok(cost.map(|cost| cost.p50))
+    };
+    let (kernel_ns, registers_ns) = (way("kernel", FastGpio::Off)?, way("registers", wish)?);
+    let edge = EdgeCost { line: name.to_owned(), kernel_ns, registers_ns };
     Ok((text + &format!("on {}\n", computer_name()), edge))
 }
 

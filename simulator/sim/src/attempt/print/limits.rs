@@ -66,7 +66,7 @@ impl Limits {
     fn share(&self, motors: &[&Pace]) -> Option<f64> {
         let EdgeCost { kernel_ns, registers_ns, .. } = self.edge.as_ref()?;
         let steps_per_s: f64 = motors.iter().map(|pace| pace.steps_per_s).sum();
-        Some(2.0 * steps_per_s * registers_ns.unwrap_or(*kernel_ns) / 1e9)
+        Some(2.0 * steps_per_s * registers_ns.or(*kernel_ns)? / 1e9)
     }
 
     pub(super) fn lines(&self, page: &mut Page, motors: &[&Pace]) {

@@ -111,8 +111,9 @@ pub(crate) fn run(
         has_begun: false,
         unknown: Vec::new(),
         config: &own.config,
+        limits,
     };
-    let printed = Printed { limits, ..printing.run() };
+    let printed = printing.run();
     let took = began.elapsed();
     printing.host.watch.progress.end();
     if ended.load(Ordering::SeqCst) {
@@ -170,6 +171,7 @@ struct Print<'a> {
     /// What klippy says about commands that it does not know. It goes on then.
     unknown: Vec<String>,
     config: &'a Config,
+    limits: Option<Limits>,
 }
 
 impl Print<'_> {
@@ -211,7 +213,7 @@ impl Print<'_> {
             layers: layers(&points),
             filament_mm: points.iter().map(|point| f64::from(point.laid_mm)).sum(),
             motors: self.host.watch.paces.take().map_or_else(Vec::new, |paces| paces.most().cloned().collect()),
-            limits: None,
+            limits: self.limits.take(),
             heaters: self.heaters.clone(),
             compared,
             lost,
