@@ -667,7 +667,9 @@ fn load_cell(clock: Monotonic, lasts: Duration, alone: bool) {
 }
 
 fn main() {
-    watch_tick().map(thread::JoinHandle::join).expect("a thread").expect("no panic");
+    let watcher = watch_tick().expect("a thread");
+    let _ = Monotonic::start().tick_after(Clock::EPOCH);
+    watcher.join().expect("no panic");
     // `cargo bench -p pinion-benches --bench bits -- hx711 3600 [alone]`: only this, for so many seconds.
     let mut words = std::env::args().skip_while(|word| word != "hx711").skip(1);
     if let Some(seconds) = words.next().and_then(|word| word.parse().ok()) {

@@ -50,6 +50,10 @@ pub(crate) struct LatencyArgs {
 
 /// Measures, prints and judges.
 pub(crate) fn run(args: &LatencyArgs) -> ExitCode {
+    let svg = match args.svg.as_deref().map(|path| Output::check(path, &[])).transpose() {
+        Ok(svg) => svg,
+        Err(error) => return failed(error),
+    };
     let computer = Computer::at(Path::new("/"));
     if let Some(why) = print_at_risk(&computer) {
         return failed(format!("the latency is not measured: {why}"));
@@ -65,10 +69,6 @@ pub(crate) fn run(args: &LatencyArgs) -> ExitCode {
         });
         return page.and_then(|page| print(&page)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let svg = match args.svg.as_deref().map(|path| Output::check(path, &[])).transpose() {
-        Ok(svg) => svg,
-        Err(error) => return failed(error),
-    };
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let (scheduling, halves) = match measure_both(span) {
         Ok(measured) => measured,

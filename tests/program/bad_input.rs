@@ -3,9 +3,10 @@
 //! remedy. The process is ready for the next FIRMWARE_RESTART. A wrong file ends the command with one line.
 
 use std::fs::{self, File};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use pinion_client::Client;
+use pinion_client::serial::Port;
 use pinion_protocol::block::Sequence;
 
 use crate::process::{Pinion, WAIT_MAX, limited};
@@ -145,18 +146,19 @@ fn a_block_out_of_order_is_answered_by_a_nak() {
     let pinion = Pinion::simulated(&[]);
     let mut port = pinion.port();
     // No block was sent before, so the MCU expects number 0.
-    port.queue_block(&[], Sequence::default().next());
-    let mut until = Instant::now() + WAIT_MAX;
-    let mut empty = 0;
-    while let Some((sequence, payload)) = port.wait_block(until).unwrap() {
-        assert_eq!(sequence, Sequence::default());
-        // A new MCU sends `starting`.
+    let (expected, next) = (Sequence::default(), Sequence::default().next());
+    port.queue_block(&[], next);
+    // A new MCU sends `starting`.
+    let empty = |port: &mut Port| loop {
+        let block = port.wait_block(Instant::now() + WAIT_MAX).unwrap();
+        let (sequence, payload) = block.expect("an acknowledgement");
         if payload.is_empty() {
-            empty += 1;
-            until = Instant::now() + Duration::from_millis(50);
+            break sequence;
         }
-    }
-    assert_eq!(empty, 1, "one NAK");
+    };
+    assert_eq!(empty(&mut port), expected);
+    port.queue_block(&[], expected);
+    assert_eq!(empty(&mut port), next, "one NAK");
 }
 
 #[test]
@@ -168,11 +170,7 @@ fn a_file_of_any_kind_ends_the_command_in_words() {
     fs::create_dir(&directory).unwrap();
     File::create(&sparse).unwrap().set_len(5 << 30).unwrap();
     let ends = |args: &[&str], cause: &str| {
-        // `latency` does not measure beside the host of another test.
-        let (code, said) = pinion_testkit::wait::until_some(
-            || Some(limited(args)).filter(|(_, said)| !said.contains("is attached to Pinion")),
-            || "a computer without another host".into(),
-        );
+        let (code, said) = limited(args);
         assert_eq!(code, Some(1), "{args:?}: {said}");
         assert!(said.contains(cause), "{args:?}: {said}");
     };

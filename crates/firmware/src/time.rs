@@ -107,7 +107,7 @@ pub trait TimeSource: Send + Sync {
     }
 
     /// When the first tick of the kernel after this instant begins. It interrupts all processors at once. `None` if
-    /// nothing is known of it.
+    /// nothing is known of it. The first call may start the search for it.
     fn tick_after(&self, at: Clock) -> Option<Clock> {
         let _ = at;
         None

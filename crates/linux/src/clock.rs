@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::io;
 use std::mem;
 use std::sync::OnceLock;
-use std::thread;
+use std::thread::{self, Thread};
 use std::time::Duration;
 
 use nix::poll::PollTimeout;
@@ -57,24 +57,37 @@ impl TimeSource for Monotonic {
     }
 
     fn tick_after(&self, at: Clock) -> Option<Clock> {
-        Some(self.instant_of(TICK.get()?.after(self.duration_of(at))))
+        let Some(tick) = TICK.get() else {
+            if let Some(watcher) = TICK_WATCHER.get() {
+                watcher.unpark();
+            }
+            return None;
+        };
+        Some(self.instant_of(tick.after(self.duration_of(at))))
     }
 }
 
 /// The kernel's tick, when [`watch_tick`] has found it.
 static TICK: OnceLock<KernelTick> = OnceLock::new();
 
-/// Starts a thread that finds the kernel's tick, for [`TimeSource::tick_after`]. It takes some ten ticks.
+/// The thread that finds it.
+static TICK_WATCHER: OnceLock<Thread> = OnceLock::new();
+
+/// Starts the thread that finds the kernel's tick. It sleeps until [`TimeSource::tick_after`] asks for the first time:
+/// most printers have nothing that asks, and watching some ten ticks takes 30 to 40 ms of a processor.
 ///
 /// # Errors
 ///
 /// The kernel's refusal of a thread.
 pub fn watch_tick() -> io::Result<thread::JoinHandle<()>> {
-    thread::Builder::new().name("tick".into()).spawn(|| {
+    let watcher = thread::Builder::new().name("tick".into()).spawn(|| {
+        thread::park();
         if let Some(tick) = KernelTick::measure() {
             let _ = TICK.set(tick);
         }
-    })
+    })?;
+    let _ = TICK_WATCHER.set(watcher.thread().clone());
+    Ok(watcher)
 }
 
 /// The step of a clock that was read at once after each reading. All spans between readings are multiples of the step,
@@ -218,7 +231,9 @@ mod tests {
     #[test]
     fn the_kernel_s_next_tick_is_soon() {
         let clock = Monotonic::start();
-        watch_tick().unwrap().join().unwrap();
+        let watcher = watch_tick().unwrap();
+        assert_eq!(clock.tick_after(clock.now()), None);
+        watcher.join().unwrap();
         let Some(at) = clock.tick_after(clock.now()) else {
             return println!("NOT RUN: this computer is too busy to see ticks");
         };

@@ -41,6 +41,8 @@ impl Pace {
 
     /// A pace with this clock.
     pub(super) fn of(clock: Arc<dyn TimeSource>) -> Pace {
+        // This starts the search for the kernel's tick, which is over before the first message.
+        let _ = clock.tick_after(clock.now());
         Pace { clock, stopped: Arc::default() }
     }
 
