@@ -113,8 +113,9 @@ else
 	@echo 'NOT RUN: the tests in the virtual machine, which need an x86-64 computer' >&2
 endif
 
+# Fewer random cases of each property than proptest's 256, which `cargo test` alone has.
 test-programs:
-	'$(CARGO)' test --locked
+	PROPTEST_CASES=$${PROPTEST_CASES:-64} '$(CARGO)' test --locked
 
 # Its lines would stand among those of the other tests.
 test-drivers:
@@ -122,6 +123,7 @@ test-drivers:
 	    cat "$$log" && rm "$$log" && exit $$status
 
 # One after the other: each has its own times.
+test-all: export PROPTEST_CASES = 256
 test-all: check test test-slow test-kernel figures
 	@$(MAKE) --no-print-directory fuzz TOTAL=60
 	@if [ $$(id -u) = 0 ]; then $(MAKE) --no-print-directory test-package; \
