@@ -16,10 +16,8 @@ fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let (toml, trace) = (folder.path().join("slow.toml"), folder.path().join("trace"));
     let printer = printed(&["sim", "--print-board"]);
-    let slow = printer.replace(
-        "name = \"spidev0.0\"\n",
-        &format!("name = \"spidev0.0\"\ndelay_us = {}\ntrace_pins = [\"beeper\"]\n", 1000 * delay_ms),
-    );
+    let slow =
+        printer.replace("name = \"spidev0.0\"\n", &format!("name = \"spidev0.0\"\ndelay_us = {}\n", 1000 * delay_ms));
     assert_ne!(slow, printer, "the built-in printer's bus has another name");
     fs::write(&toml, slow).unwrap();
     let [board, record] = [&toml, &trace].map(|path| path.to_str().unwrap());
@@ -42,61 +40,23 @@ fn transfer(client: &mut Client, number: u8) -> Result<Vec<u8>, Error> {
     Ok(answer.bytes("response")?.to_vec())
 }
 
-/// The bytes that the chip received in each transfer, in hex, and the level of D/C at each byte.
-fn heard(trace: &PathBuf) -> Vec<(String, String)> {
+/// The bytes that the chip received in each transfer, in hex.
+fn heard(trace: &PathBuf) -> Vec<String> {
     let trace = fs::read_to_string(trace).unwrap();
-    let field = |line: &str, key: &str| {
-        let field = line.split(' ').find_map(|field| field.strip_prefix(key));
-        field.unwrap_or_else(|| panic!("no {key} in {line}")).to_owned()
-    };
-    trace.lines().map(|line| (field(line, "sent="), field(line, "beeper="))).collect()
+    let sent =
+        |line: &str| line.split(' ').find_map(|field| field.strip_prefix("sent=")).expect("its bytes").to_owned();
+    trace.lines().map(sent).collect()
 }
 
-#[track_caller]
-fn each_transfer_happens_once_and_has_its_own_answer(delay_ms: u64, count: u8) {
-    let (pinion, trace) = slow_printer(delay_ms);
-    let mut client = pinion.configured(DISPLAY);
-    for number in 0..count {
-        assert_eq!(transfer(&mut client, number).unwrap(), [number]);
-    }
-    let sent: Vec<String> = heard(&trace).into_iter().map(|(sent, _)| sent).collect();
-    let asked: Vec<String> = (0..count).map(|number| format!("{number:02x}")).collect();
-    assert_eq!(sent, asked);
-}
-
-#[test]
-fn transfers_of_4_ms_happen_once_and_have_their_own_answers() {
-    each_transfer_happens_once_and_has_its_own_answer(4, 100);
-}
-
+/// The client sends a block again that is not acknowledged in time.
 #[test]
 fn transfers_of_400_ms_happen_once_and_have_their_own_answers() {
-    each_transfer_happens_once_and_has_its_own_answer(400, 5);
-}
-
-/// klippy's SPI4wire (extras/display/uc1701.py): D/C at its level, then the bytes.
-#[test]
-fn a_display_sees_its_line_and_its_bytes_in_order() {
-    let (pinion, trace) = slow_printer(4);
+    let (pinion, trace) = slow_printer(400);
     let mut client = pinion.configured(DISPLAY);
-    for n in 0..60 {
-        // Short messages share blocks. Each long message has its own block.
-        let bytes = format!("{n:02x}").repeat(1 + n % 40);
-        client.send_line(&format!("update_digital_out oid=1 value={}", n % 2)).unwrap();
-        let commands = [
-            client.messages().encode_line(&format!("spi_send oid=0 data={bytes}")).unwrap(),
-            client.messages().encode_line(&format!("update_digital_out oid=1 value={}", 1 - n % 2)).unwrap(),
-        ];
-        client.send_encoded(&commands).unwrap();
+    for number in 0..5 {
+        assert_eq!(transfer(&mut client, number).unwrap(), [number]);
     }
-    client.link().settle().unwrap();
-    let heard = heard(&trace);
-    assert_eq!(heard.len(), 60, "{heard:?}");
-    for (n, (sent, levels)) in heard.iter().enumerate() {
-        let length = 1 + n % 40;
-        assert_eq!(*sent, format!("{n:02x}").repeat(length));
-        assert_eq!(*levels, (n % 2).to_string().repeat(length), "D/C at message {n}");
-    }
+    assert_eq!(heard(&trace), ["00", "01", "02", "03", "04"]);
 }
 
 /// An MCU with a bus that hangs, and a command that waits for the bus.
@@ -107,7 +67,7 @@ fn hanging() -> (Pinion, Client) {
     client.send_line("update_digital_out oid=1 value=1").unwrap();
     // The answer shows that the MCU has also received the transfer.
     client.query("get_clock", &[], "clock", None).unwrap();
-    assert_eq!(heard(&trace), []);
+    assert!(heard(&trace).is_empty());
     (pinion, client)
 }
 
@@ -141,10 +101,4 @@ fn a_signal_gets_past_a_bus_that_hangs() {
     assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
     assert!(pinion.log().contains("shutdown: Force shutdown command: "), "{}", pinion.log());
     assert!(pinion.log().contains("spi0 does not answer"), "{}", pinion.log());
-}
-
-#[test]
-fn a_bus_that_hangs_for_ever_stops_the_mcu() {
-    let (_pinion, mut client) = hanging();
-    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Bus does not answer"));
 }
