@@ -43,11 +43,6 @@ pub(super) const STEPS: &[Step] = &[
     Step { name: "cooled", run: heaters::cooled },
 ];
 
-/// Whether a step comes before anything is homed.
-pub(super) fn is_first(step: &str) -> bool {
-    ["ready", "homed"].contains(&step)
-}
-
 fn skipped<T>(why: impl Into<String>) -> Result<T, Outcome> {
     Err(Outcome::Skipped(why.into()))
 }
