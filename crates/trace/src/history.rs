@@ -181,7 +181,7 @@ impl<'a> History<'a> {
             End::Shutdown { reason, .. } => format!("the MCU stopped: {}", cut(reason, REASON_MAX)),
             End::Died => "the program died".to_owned(),
             End::Hung { diagnosis } => format!("the core hung: {}", cut(diagnosis, REASON_MAX)),
-            End::Asked => "the recording was asked for".to_owned(),
+            End::Asked => "somebody asked for the recording".to_owned(),
         }
     }
 
