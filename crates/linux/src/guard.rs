@@ -161,7 +161,7 @@ mod tests {
     use super::*;
     use pinion_firmware::board::Direction;
 
-    /// What the guardian did, and what it refuses from now on.
+    /// The calls to the guardian, and whether it refuses them from now on.
     #[derive(Default)]
     struct Seen {
         calls: Vec<String>,

@@ -11,7 +11,7 @@ use crate::children;
 use crate::real::real;
 use crate::turns::{self, NEVER};
 
-/// What a thread waits for.
+/// The event that a thread waits for.
 #[derive(Clone, Copy)]
 pub(crate) enum Wait {
     /// A time only.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the pins of a stepper driver move.
+//! Axes: the pins of a stepper driver, its motor, and the rails that the motor moves.
 //!
 //! The core of a board drives the pins of its motors. Any thread may read. Nothing here locks, blocks or allocates.
 

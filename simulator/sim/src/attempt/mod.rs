@@ -29,10 +29,10 @@ use steps::STEPS;
 use trial::Trial;
 pub(crate) use watching::{Host, Watching};
 
-/// What klippy does on the printer.
+/// The work of klippy on the printer.
 #[derive(Clone, Debug)]
 pub(crate) enum Task {
-    /// What every owner does after a change (`--try`).
+    /// The steps of every owner after a change (`--try`).
     Try,
     /// It prints a file (`--print`).
     Print(PrintOptions),

@@ -35,7 +35,7 @@ const BUSY: [&str; 7] = [
     "Timeout on wait for",
 ];
 
-/// What is tried, and how far it came.
+/// A printer under trial, and how far the trial came.
 pub(super) struct Trial<'a> {
     pub(super) attempt: &'a Attempt,
     folder: &'a Folder,
@@ -242,7 +242,7 @@ impl<'a> Trial<'a> {
         self.config().section("printer")?.text("kinematics")
     }
 
-    /// What klippy says about its toolhead.
+    /// klippy's status of its toolhead.
     pub(super) fn toolhead(&mut self) -> Result<Value, Outcome> {
         match self.host.query(&["toolhead"]) {
             Ok(mut status) => Ok(status["toolhead"].take()),

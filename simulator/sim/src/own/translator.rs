@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What all parts of the translation of a printer.cfg share: pins, each of which one section takes, buses, and notes.
+//! The shared state of a translation of a printer.cfg: pins (only one section can take each), buses, and notes.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 

@@ -17,7 +17,7 @@ mod square;
 use super::report::Outcome;
 use super::trial::Trial;
 
-/// What a step saw of a printer that works. The error is any other outcome.
+/// The observation of a step on a printer that works. The error is any other outcome.
 type Seen = Result<String, Outcome>;
 
 /// Something that is tried.
