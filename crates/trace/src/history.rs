@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::Refusal;
 
-use super::event::{Event, PowerFault, Watched};
+use super::event::{Event, PowerFault};
 use super::file::{End, Head, Trace};
 use pinion_linux::foreign::plain;
 
@@ -96,6 +96,15 @@ impl<'a> History<'a> {
     /// All deeds with the numbers of their lanes.
     pub fn deeds(&self) -> impl Iterator<Item = (usize, &Deed)> {
         self.lanes.iter().enumerate().flat_map(|(lane, all)| all.deeds.iter().map(move |deed| (lane, deed)))
+    }
+
+    /// When the core was awake: between its sleeps. Its next sleep is not recorded, so the last time is that of its last
+    /// event.
+    pub fn awake(&self) -> Vec<(i64, i64)> {
+        let core = self.core();
+        let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();
+        let ends = sleeps.iter().skip(1).map(|next| next.from).chain(core.last().map(|deed| deed.to));
+        sleeps.iter().zip(ends).map(|(sleep, end)| (sleep.to, end.max(sleep.to))).collect()
     }
 
     /// The lane of the core; empty if there is none.
@@ -236,10 +245,6 @@ impl<'a> History<'a> {
                 format!("worked {span} ms for {}{waited}", self.object(oid))
             }
             Event::Processor { thread, ran, waited } => {
-                let thread = match thread {
-                    Watched::Core => "core",
-                    Watched::Link => "link",
-                };
                 format!(
                     "the {thread} ran {} ms and waited {} ms for a processor",
                     ms(ran.0.into()),
@@ -334,6 +339,7 @@ fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Dee
 pub(super) mod tests {
     use super::super::file::Thread;
     use super::super::file::tests::trace;
+    use super::super::event::Watched;
     use super::*;
     use pinion_firmware::time::Clock;
     use pinion_testkit::names::any_name;
