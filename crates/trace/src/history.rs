@@ -337,9 +337,9 @@ fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Dee
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::event::Watched;
     use super::super::file::Thread;
     use super::super::file::tests::trace;
-    use super::super::event::Watched;
     use super::*;
     use pinion_firmware::time::Clock;
     use pinion_testkit::names::any_name;
