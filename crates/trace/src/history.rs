@@ -98,8 +98,7 @@ impl<'a> History<'a> {
         self.lanes.iter().enumerate().flat_map(|(lane, all)| all.deeds.iter().map(move |deed| (lane, deed)))
     }
 
-    /// When the core was awake: between its sleeps. Its next sleep is not recorded, so the last time is that of its last
-    /// event.
+    /// When the core was awake: between its sleeps. Its next sleep is not recorded, so the last span ends at its last event.
     pub fn awake(&self) -> Vec<(i64, i64)> {
         let core = self.core();
         let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();

@@ -218,7 +218,7 @@ fn await_token(token: &AtomicU32) {
     }
 }
 
-/// Waits, and lets others run meanwhile.
+/// Waits, and lets others run during the wait.
 pub(crate) fn wait(wait: Wait, deadline_ns: u64) -> WakeReason {
     let me = ME.get();
     READINGS.set(0);

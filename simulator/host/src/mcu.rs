@@ -23,7 +23,7 @@ const INPUT_BYTES_MAX: usize = 1 << 16;
 const OUTPUT_BYTES_MAX: usize = 1 << 20;
 
 /// How long the MCU takes no commands behind `finalize_config`. klippy counts on the time that its start takes: it sets each
-/// output for 0.2 s later, and `[controller_fan]` sets one anew 0.1 s after that start, for 0.1 s later. klippy sends that
+/// output for 0.2 s later, and `[controller_fan]` sets one again 0.1 s after that start, for 0.1 s later. klippy sends that
 /// only after the first time has come, which is too late if the start takes no time at all.
 const CONFIGURES: Ticks = Ticks::from_ms(50);
 

@@ -230,7 +230,7 @@ impl Screen {
             _ => lines.len(),
         };
         if self.placed != Some((size, picture_rows)) {
-            // A terminal that changes its size moves what it shows, and wraps it anew. Only the cursor still shows
+            // A terminal that changes its size moves its text, and wraps it again. Only the cursor still shows
             // where the log ends: the picture is below it, wherever that is. Its rows are deleted, because some
             // terminals keep erased ones in their history and show them again when they grow.
             out += &format!("{SAVE_CURSOR}{}{RESTORE_CURSOR}{DELETE_BELOW}", scrolling(usize::MAX));

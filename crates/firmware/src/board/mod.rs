@@ -65,8 +65,8 @@ pub enum Bias {
 }
 
 /// The value of an output in a stopped MCU, and after the death of the program. The MCU's table of claims makes it
-/// (`mcu/claims.rs`). Line, guardian and object all have this one. Others can only make that of an output that goes off
-/// (its default), or that [stays at its level](Direction::at_rest).
+/// (`mcu/claims.rs`). Line, guardian and object all have this one. Other code can only make the value of an output that
+/// goes off (the default), or that [stays at its level](Direction::at_rest).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ShutdownValue<T>(T);
 
