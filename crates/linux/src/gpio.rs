@@ -152,10 +152,11 @@ impl HeldLine {
         written.map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default()))
     }
 
-    /// Lets the line go, so that nobody can write it here.
+    /// Lets the line go. Until it is held again, writes and reads of it fail.
     fn let_go(&self) -> io::Result<()> {
-        self.flags.store(0, Ordering::Relaxed);
-        fs::File::open("/dev/null").and_then(|null| sys::replace(&self.handle, &null))
+        let null = fs::File::open("/dev/null")?;
+        self.flags.store(LineRequestFlags::OUTPUT.bits(), Ordering::Relaxed);
+        sys::replace(&self.handle, &null)
     }
 
     /// Uses these registers from now on. The line has just been requested with `direction`.

@@ -109,6 +109,7 @@ impl GuardedLine {
     }
 
     /// Whether calls to the line's chip may block.
+    #[inline]
     pub(super) fn may_sleep(&self) -> bool {
         self.sleeping.is_some()
     }
