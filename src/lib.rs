@@ -155,7 +155,7 @@ pub fn with_simulator(simulator: clap::Command) -> clap::Command {
 /// The checkout of the only klippy that this computer has.
 pub fn klipper_here() -> Option<PathBuf> {
     let klippys = klippys(&Computer::at(Path::new("/"))).into_iter();
-    // What a process sees below its own root is not here.
+    // A process with another root sees other files.
     let folders = klippys.filter_map(|klippy| klippy.folder).filter(|folder| !folder.starts_with("/proc"));
     let mut folders: Vec<PathBuf> = folders.filter_map(|folder| Some(folder.parent()?.to_owned())).collect();
     folders.dedup();

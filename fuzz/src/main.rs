@@ -36,7 +36,7 @@ const TARGETS: &[Target] = &[
     ("printer_cfg", printer_cfg::run),
     ("printer_config", printer_config::run),
     ("search", pinion_runtime::fuzz::search),
-    ("sources", pinion_runtime::klippy::sources::fuzz),
+    ("sources", pinion_runtime::klippy::sources::fuzz::sources),
     ("status", status::run),
     ("trace", trace::run),
 ];

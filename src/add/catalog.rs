@@ -439,7 +439,7 @@ mod tests {
         assert!(known >= 5, "{known}");
     }
 
-    /// What each of these sections takes from a device, on a Raspberry Pi 4.
+    /// The resources of a device that each of these sections takes, on a Raspberry Pi 4.
     #[test]
     fn two_devices_are_not_put_on_the_same_pins() {
         let catalog = Catalog::read().unwrap();

@@ -3,7 +3,7 @@
 //!
 //! A file is replaced by a rename: a program that is killed leaves the old file or the new one. Files are reached below the
 //! descriptor of their folder ([`OwnFolder`]), never through a link in their place. Files of printer.cfg's owner are written
-//! with that user's rights, so a link cannot make us overwrite somebody else's file. The folder is locked meanwhile.
+//! with that user's rights, so a link cannot make us overwrite somebody else's file. The folder is locked during the changes.
 //!
 //! A file that was there is copied before its first change. When the last change is taken back, the copy goes, too.
 
@@ -107,7 +107,7 @@ impl<'a> Editor<'a> {
         let name = name.ok_or_else(|| io::Error::other("its name is not usable"))?;
         let path = self.computer.resolve(file.parent().unwrap_or(Path::new("/")))?;
         let folder = if makes { OwnFolder::make(&path)? } else { OwnFolder::open(&path)? };
-        // Below --root no link is left on the way. One that comes meanwhile could lead out of it.
+        // Below --root no link is left on the way. One that comes now could lead out of it.
         if !self.computer.is_this() && fs::canonicalize(folder.at("."))? != path {
             return Err(io::Error::other("a link has appeared in its path: run this command again"));
         }

@@ -127,7 +127,7 @@ fn added(args: &AddArgs, computer: &Computer, board: Option<Board>, report: &mut
     let target = Target::find(computer, args.config.as_deref(), args.mcu.as_deref());
     let lacks = |device: &Device| {
         let klippy = target.as_ref().ok()?.klippy(computer)?;
-        klippy.lacks(device.module())
+        klippy.folder_without(device.module())
     };
     let Some(name) = &args.device else {
         return list::list(&catalog, board.as_ref(), &model, &lacks, report);

@@ -108,7 +108,7 @@ pub(super) fn undo(
     Ok(())
 }
 
-/// What the remaining sections need of the boot loader.
+/// The needs of the remaining sections from the boot loader.
 struct Needs<'a> {
     uses: &'a Uses,
     catalog: &'a Catalog,

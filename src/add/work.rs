@@ -218,7 +218,7 @@ impl Work<'_> {
         self.report.line("Next:");
         next.iter().for_each(|line| self.report.line(format_args!("  {line}")));
         if self.device.resonance
-            && let Some(remedy) = target.klippy(self.computer).and_then(|klippy| klippy.without_numpy(self.computer))
+            && let Some(remedy) = target.klippy(self.computer).and_then(|klippy| klippy.install_numpy(self.computer))
         {
             self.report.line(format_args!("SHAPER_CALIBRATE needs numpy first: {remedy}"));
         }

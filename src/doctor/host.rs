@@ -33,7 +33,7 @@ pub(super) fn printers(klippys: &[Klippy]) -> impl Iterator<Item = &Printer> {
     klippys.iter().filter_map(Klippy::printer)
 }
 
-/// What all these configurations have of a kind.
+/// The things of one kind that these configurations name.
 pub(super) fn of_all<T: Ord>(klippys: &[Klippy], kind: fn(&Printer) -> BTreeSet<T>) -> BTreeSet<T> {
     printers(klippys).flat_map(kind).collect()
 }

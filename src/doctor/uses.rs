@@ -119,7 +119,7 @@ pub(super) fn numpy(computer: &Computer, klippys: &[Klippy]) -> Vec<Finding> {
     let tested = klippys.iter().filter(|klippy| klippy.printer().is_some_and(has_tester));
     let finding = |klippy: &Klippy| {
         let found = format!("SHAPER_CALIBRATE fails: klippy's Python has no numpy ({})", klippy.found_by);
-        Some(Finding::warning(CHECK, found, klippy.without_numpy(computer)?))
+        Some(Finding::warning(CHECK, found, klippy.install_numpy(computer)?))
     };
     tested.filter_map(finding).collect()
 }

@@ -101,8 +101,12 @@ impl Figures {
     /// The file cannot be read, or is another document.
     pub fn read(path: &Path) -> Result<Figures, String> {
         let bytes = files::read(path, MIB_MAX).map_err(|error| format!("{}: {error}", path.display()))?;
-        serde_json::from_slice(&bytes)
-            .map_err(|error| format!("{}: {error}: name an output of \"pinion latency --json\"", path.display()))
+        let refused = |why: &str| format!("{}: {why}: name an output of \"pinion latency --json\"", path.display());
+        let figures: Figures = serde_json::from_slice(&bytes).map_err(|error| refused(&error.to_string()))?;
+        match figures {
+            Figures { latency: None, edge: None, .. } => Err(refused("it has no figures")),
+            figures => Ok(figures),
+        }
     }
 
     pub(super) fn json(&self) -> Result<String, String> {

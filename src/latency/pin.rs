@@ -35,7 +35,7 @@ pub(super) fn measure(name: &str, wish: FastGpio) -> Result<(String, EdgeCost), 
     let mut text = format!("{name}, {} s each way:\n", SPAN.as_secs());
     let mut way = |way: &str, wish: FastGpio| -> Result<Option<f64>, String> {
         let mut board = LinuxBoard::new(None, wish);
-        let output = Direction::Output { level: false, shutdown_value: false };
+        let output = Direction::at_rest(false);
         let claimed = board.line(line, output).map_err(|stop| stop.to_string())?;
         let is_possible = wish == FastGpio::Off || claimed.line.is_fast();
         let cost = is_possible.then(|| cost(&*claimed.line)).transpose();

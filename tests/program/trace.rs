@@ -120,7 +120,7 @@ fn the_newest_recording_is_found_and_all_are_listed() {
     let listed = out(&trace(folder.path(), &["--list"]));
     let lines: Vec<&str> = listed.lines().collect();
     assert_eq!(lines.len(), 3, "{listed}");
-    assert!(lines[0].starts_with("2026-11-22 14:27:14 UTC") && lines[0].contains("not known why"), "{listed}");
+    assert!(lines[0].starts_with("2026-11-22 14:27:14 UTC") && lines[0].contains("it is unknown why"), "{listed}");
     assert!(lines[1].starts_with("2026-11-22 14:26:14 UTC") && lines[1].ends_with(VERDICT), "{listed}");
     assert!(lines[2].starts_with("cannot be read") && lines[2].ends_with("it is not a trace of Pinion"), "{listed}");
 

@@ -322,9 +322,10 @@ impl Board for LinuxBoard {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pinion_firmware::board::ShutdownValue;
     use std::fs;
 
-    const ON: Direction = Direction::Output { level: true, shutdown_value: false };
+    const ON: Direction = Direction::at_rest(true);
 
     fn board(dev: &Path) -> LinuxBoard {
         LinuxBoard {
@@ -479,8 +480,8 @@ mod tests {
             let names = board.pins();
             let range = names.iter().find(|range| range.name == format!("pwmchip{chip}/pwm0")).unwrap();
             let pin = Pin(range.first + channel);
-            let config =
-                PwmConfig { pin, cycle: pinion_firmware::time::Ticks::from_us(100), value: 0, shutdown_value: 0 };
+            let cycle = pinion_firmware::time::Ticks::from_us(100);
+            let config = PwmConfig { pin, cycle, value: 0, shutdown_value: ShutdownValue::default() };
             board.pwm(config).unwrap().bus
         };
         assert_eq!((bus(0, 0), bus(0, 1), bus(1, 0)), ("pwmchip0".into(), "pwmchip0".into(), "pwmchip1".into()));

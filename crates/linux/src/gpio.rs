@@ -12,11 +12,11 @@ use std::fs;
 use std::io;
 use std::os::fd::AsRawFd;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use gpio_cdev::{LineHandle, LineRequestFlags};
 
-use super::guard::SharedGuard;
+use super::guard::{GuardedLine, SharedGuard};
 use crate::places::GPIO;
 use crate::sys;
 use pinion_firmware::board::{Bank, Bias, Direction, Line};
@@ -110,11 +110,11 @@ impl Handle {
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let (flags, watched) = (AtomicU32::new(bits), AtomicBool::new(false));
         let Handle { line, subject } = self;
-        let line = HeldLine { handle, line, subject, flags, registers: None, guard, watched, sleeping };
-        line.watch_over(direction)?;
-        Ok(line)
+        let guarded = GuardedLine::new(guard, format!("{} line {}", subject.chip, subject.offset), sleeping);
+        // Without the guardian's copy the line is released here.
+        guarded.hold(handle.as_raw_fd(), direction.shutdown_value())?;
+        Ok(HeldLine { handle, line, subject, flags: AtomicU32::new(bits), registers: None, guarded })
     }
 }
 
@@ -134,11 +134,7 @@ pub(super) struct HeldLine {
     /// The flags of the last setup (`GPIOHANDLE_REQUEST_`), and [`FAST`].
     flags: AtomicU32,
     registers: Option<(LineRegisters, &'static RegisterBank)>,
-    guard: SharedGuard,
-    /// Whether the guardian has a copy of it.
-    watched: AtomicBool,
-    /// The name of the line's chip, if calls to this chip may block.
-    sleeping: Option<String>,
+    guarded: GuardedLine,
 }
 
 impl HeldLine {
@@ -146,7 +142,7 @@ impl HeldLine {
     #[cold]
     #[inline(never)]
     fn lost(&self, reason: ShutdownReason, what: &str, code: i32) -> Shutdown {
-        Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
+        Shutdown::because(reason, self.subject.lost(what, code, self.guarded.may_sleep()))
     }
 
     /// Writes a line of a chip that may block. It is apart, so that the core's writes need not save its registers.
@@ -156,24 +152,11 @@ impl HeldLine {
         written.map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default()))
     }
 
-    /// Gives the line to the guardian if it is an output now. Otherwise takes it back from the guardian.
-    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
-        match direction {
-            Direction::Output { shutdown_value, .. } => {
-                let name = self.guarded_name();
-                self.guard.output(&name, self.handle.as_raw_fd(), shutdown_value, self.sleeping.as_deref())?;
-                self.watched.store(true, Ordering::Relaxed);
-                Ok(())
-            }
-            Direction::Input(_) | Direction::OpenDrain => self.watch_no_more(),
-        }
-    }
-
-    fn watch_no_more(&self) -> Result<(), Shutdown> {
-        match self.watched.swap(false, Ordering::Relaxed) {
-            true => self.guard.forget(&self.guarded_name()),
-            false => Ok(()),
-        }
+    /// Lets the line go. Until it is held again, writes and reads of it fail.
+    fn let_go(&self) -> io::Result<()> {
+        let null = fs::File::open("/dev/null")?;
+        self.flags.store(LineRequestFlags::OUTPUT.bits(), Ordering::Relaxed);
+        sys::replace(&self.handle, &null)
     }
 
     /// Uses these registers from now on. The line has just been requested with `direction`.
@@ -211,24 +194,24 @@ impl HeldLine {
         if self.registers.as_ref().is_some_and(|(registers, _)| registers.is(output)) { FAST } else { 0 }
     }
 
-    fn guarded_name(&self) -> String {
-        format!("{} line {}", self.subject.chip, self.subject.offset)
-    }
-
     /// Releases the line and requests it again, because Linux before 5.5 cannot change a held line. Klipper's C program
     /// always does this. If the request is refused, the line stays what it was.
     fn request_anew(&self, setup: &LineSetup) -> Result<i32, Shutdown> {
-        // While nobody holds the line, it is not ours to write.
-        let before = LineRequestFlags::from_bits_retain(self.flags.fetch_and(!FAST, Ordering::Relaxed) & !FAST);
+        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed) & !FAST);
         let level = self.handle.get_value().unwrap_or_default();
         // The kernel keeps a line as long as anybody has a copy.
-        self.watch_no_more()?;
-        let request = |flags, level| match self.line.request(flags, level, CONSUMER) {
-            Ok(handle) => sys::replace(&self.handle, &handle).map_or_else(code_of, |()| 0),
-            Err(error) => errno(&error),
+        self.guarded.hold(self.handle.as_raw_fd(), None)?;
+        let request = |flags: LineRequestFlags, level| {
+            let bits = flags.bits();
+            match self.line.request(flags, level, CONSUMER) {
+                Ok(handle) => sys::replace(&self.handle, &handle).map_or_else(code_of, |()| {
+                    self.flags.store(bits, Ordering::Relaxed);
+                    0
+                }),
+                Err(error) => errno(&error),
+            }
         };
-        let let_go = fs::File::open("/dev/null").and_then(|null| sys::replace(&self.handle, &null));
-        let refused = let_go.map_or_else(code_of, |()| request(setup.flags.clone(), setup.level.into()));
+        let refused = self.let_go().map_or_else(code_of, |()| request(setup.flags.clone(), setup.level.into()));
         if refused != 0 {
             request(before, level);
         }
@@ -250,7 +233,7 @@ impl Line for HeldLine {
             registers.write(level);
             return Ok(());
         }
-        if self.sleeping.is_some() {
+        if self.guarded.may_sleep() {
             return self.write_checked(flags, level);
         }
         let written = sys::set_line(&self.handle, level);
@@ -268,8 +251,10 @@ impl Line for HeldLine {
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.turn(direction)?;
-        self.watch_over(direction)
+        let line = self.handle.as_raw_fd();
+        // (If even this fails, the MCU stops because of what failed before.)
+        let let_go = || drop(self.let_go());
+        self.guarded.set_up(line, direction.shutdown_value(), || self.turn(direction), let_go)
     }
 
     fn is_fast(&self) -> bool {

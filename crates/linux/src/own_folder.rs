@@ -84,7 +84,7 @@ pub struct PathEnd {
     pub folder: OwnedFd,
     /// The last name: not a link.
     pub name: OsString,
-    /// What has this name, opened with `O_PATH`. `None` if there is nothing.
+    /// The file with this name, opened with `O_PATH`. `None` if there is none.
     pub there: Option<OwnedFd>,
 }
 

@@ -73,7 +73,7 @@ pub(super) struct Pwm {
 }
 
 impl Pwm {
-    /// Exports the channel if necessary, sets its period and value, and gives it to the guardian. `class` is
+    /// Exports the channel if necessary, sets its period, gives it to the guardian, and sets its value. `class` is
     /// `/sys/class/pwm`.
     ///
     /// # Errors
@@ -99,8 +99,8 @@ impl Pwm {
         let (duty, enable, period) = (open("duty_cycle")?, open("enable")?, open("period")?);
         let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable, guard };
         pwm.set_period(config.cycle, config.value)?;
+        pwm.watch_over(config.shutdown_value.get())?;
         pwm.write(config.value).map_err(|error| refused("its first value", error))?;
-        pwm.watch_over(config.shutdown_value)?;
         Ok(pwm)
     }
 
@@ -167,8 +167,8 @@ impl board::Pwm for Pwm {
     /// An output of `set_pwm_out` keeps its value when the MCU stops. So the guardian gets this value, too.
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.set_period(cycle, value)?;
-        self.set(value)?;
-        self.watch_over(value)
+        self.watch_over(value)?;
+        self.set(value)
     }
 }
 
@@ -234,12 +234,12 @@ fn trouble(error: &io::Error, cause: String) -> Trouble {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::board::{Pin, Pwm as _};
+    use pinion_firmware::board::{Pin, Pwm as _, ShutdownValue};
 
     const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
 
     fn config(value: u16) -> PwmConfig {
-        PwmConfig { pin: Pin(65537), cycle: Ticks::from_ms(1), value, shutdown_value: 0 }
+        PwmConfig { pin: Pin(65537), cycle: Ticks::from_ms(1), value, shutdown_value: ShutdownValue::default() }
     }
 
     fn class(exported: bool) -> tempfile::TempDir {
@@ -277,6 +277,34 @@ mod tests {
         assert_eq!(state("duty_cycle"), "1000000");
         pwm.set(0).unwrap();
         assert_eq!(state("enable"), "0");
+    }
+
+    struct Lost;
+
+    impl crate::Guard for Lost {
+        fn output(&mut self, _: &str, _: i32, _: ShutdownValue<bool>, _: Option<&str>) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn files(&mut self, _: &str, _: &[(i32, &[u8])]) -> io::Result<()> {
+            Err(io::Error::other("it is gone"))
+        }
+
+        fn forget(&mut self, _: &str) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn release(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_channel_that_the_guardian_does_not_take_is_not_switched_on() {
+        let class = class(true);
+        let error = Pwm::open(class.path(), CHANNEL, &config(8192), SharedGuard::new(Some(Box::new(Lost))));
+        assert_eq!(error.err().unwrap().reason, reason::GUARDIAN_LOST);
+        assert_eq!((read(&class, "duty_cycle"), read(&class, "enable")), (String::new(), String::new()));
     }
 
     #[test]

@@ -4,9 +4,6 @@
 
 use super::Malformed;
 
-/// Longest encoding that a writer makes, in bytes.
-pub const MAX_BYTES: usize = 5;
-
 /// Reads a message's values from the front of its bytes.
 #[derive(Clone, Copy, Debug)]
 pub struct Reader<'a>(&'a [u8]);

@@ -42,7 +42,7 @@ mod trouble;
 #[cfg(fuzzing)]
 pub mod fuzz {
     pub use super::guardian::fuzz::guardian;
-    pub use super::host::search::search;
+    pub use super::host::search::fuzz::search;
     pub use super::link::thread::fuzz::link;
 }
 

@@ -109,7 +109,7 @@ impl<'a> Ring<'a> {
         if number < self.oldest_whole() { Lookup::Overwritten } else { Lookup::Record(record) }
     }
 
-    /// The newest records, the oldest of them first. A record that its writer overwrites meanwhile is left out.
+    /// The newest records, the oldest of them first. A record that its writer overwrites during the read is left out.
     pub fn newest(self) -> Vec<Record> {
         let end = self.next();
         let start = end.saturating_sub(self.capacity() as u64);

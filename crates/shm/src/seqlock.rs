@@ -39,8 +39,7 @@ impl<W: Deref<Target = [AtomicU64]>> Seqlock<W> {
         &self.0[1 + (stores & 1) as usize * length..][..length]
     }
 
-    /// The words, as `copy` makes something of them. It is called again if they may have changed meanwhile. So it has to
-    /// bear words that do not belong together.
+    /// Calls `copy` with the words until it has seen a consistent set. `copy` must tolerate torn data.
     pub fn load<T>(&self, mut copy: impl FnMut(&mut dyn Iterator<Item = u64>) -> T) -> T {
         loop {
             let stores = self.0[0].load(Ordering::Acquire);
@@ -52,7 +51,7 @@ impl<W: Deref<Target = [AtomicU64]>> Seqlock<W> {
         }
     }
 
-    /// Stores words. If they are fewer than there is room for, the rest is any. Only one thread may store.
+    /// Stores words. Words beyond these are unspecified. Only one thread may store.
     pub fn store(&self, words: impl IntoIterator<Item = u64>) {
         let stores = self.0[0].load(Ordering::Relaxed).wrapping_add(1);
         // A reader that sees one of these words also sees that the former words in this place are outdated.

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Events of a recording: what happened, in 16 bytes with its time.
 
+use std::fmt;
+
 use pinion_firmware::time::{Clock, Ticks};
 use pinion_protocol::block::Refusal;
 
@@ -149,6 +151,12 @@ pub enum Watched {
     Core,
     /// The link.
     Link,
+}
+
+impl fmt::Display for Watched {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if *self == Watched::Core { "core" } else { "link" })
+    }
 }
 
 /// A fault of the computer itself.

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::Refusal;
 
-use super::event::{Event, PowerFault, Watched};
+use super::event::{Event, PowerFault};
 use super::file::{End, Head, Trace};
 use pinion_linux::foreign::plain;
 
@@ -98,6 +98,14 @@ impl<'a> History<'a> {
         self.lanes.iter().enumerate().flat_map(|(lane, all)| all.deeds.iter().map(move |deed| (lane, deed)))
     }
 
+    /// When the core was awake: between its sleeps. Its next sleep is not recorded, so the last span ends at its last event.
+    pub fn awake(&self) -> Vec<(i64, i64)> {
+        let core = self.core();
+        let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();
+        let ends = sleeps.iter().skip(1).map(|next| next.from).chain(core.last().map(|deed| deed.to));
+        sleeps.iter().zip(ends).map(|(sleep, end)| (sleep.to, end.max(sleep.to))).collect()
+    }
+
     /// The lane of the core; empty if there is none.
     pub fn core(&self) -> &[Deed] {
         self.lanes.iter().find(|lane| lane.thread == "core").map_or(&[], |lane| &lane.deeds)
@@ -181,7 +189,7 @@ impl<'a> History<'a> {
             End::Shutdown { reason, .. } => format!("the MCU stopped: {}", cut(reason, REASON_MAX)),
             End::Died => "the program died".to_owned(),
             End::Hung { diagnosis } => format!("the core hung: {}", cut(diagnosis, REASON_MAX)),
-            End::Asked => "the recording was asked for".to_owned(),
+            End::Asked => "somebody asked for the recording".to_owned(),
         }
     }
 
@@ -236,10 +244,6 @@ impl<'a> History<'a> {
                 format!("worked {span} ms for {}{waited}", self.object(oid))
             }
             Event::Processor { thread, ran, waited } => {
-                let thread = match thread {
-                    Watched::Core => "core",
-                    Watched::Link => "link",
-                };
                 format!(
                     "the {thread} ran {} ms and waited {} ms for a processor",
                     ms(ran.0.into()),
@@ -332,6 +336,7 @@ fn deeds(events: &[(i64, Event)], came: &HashMap<u32, i64>, end: i64) -> Vec<Dee
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::event::Watched;
     use super::super::file::Thread;
     use super::super::file::tests::trace;
     use super::*;

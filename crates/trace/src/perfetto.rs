@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::event::{Event, Watched};
+use super::event::Event;
 use super::file::Trace;
 use super::history::{Deed, History, short};
 use pinion_linux::foreign::plain_json;
@@ -123,10 +123,6 @@ impl<W: Write> File<'_, W> {
         let counter = match deed.event {
             Event::Late { late, .. } => Some(("late".to_owned(), "us", us(late.0.into()))),
             Event::Processor { thread, waited, .. } => {
-                let thread = match thread {
-                    Watched::Core => "core",
-                    Watched::Link => "link",
-                };
                 Some((format!("{thread} waited for a processor"), "us", us(waited.0.into())))
             }
             Event::Stolen(ticks) => Some(("a hypervisor took".to_owned(), "us", us(ticks.0.into()))),

@@ -161,10 +161,7 @@ fn rows(history: &History<'_>, window: &Window) -> Vec<Row> {
     let busy = |event: &Event| matches!(event, Event::JobBegan { .. } | Event::JobEnded { .. });
     let buses = history.lanes.iter().filter(|lane| lane.deeds.iter().any(|deed| busy(&deed.event)));
     rows.extend(buses.take(BUSES_MAX).map(|lane| row(&short(lane.thread), BUS, of(&lane.deeds, busy), false)));
-    let sleeps: Vec<(i64, i64)> = of(core, |event| matches!(event, Event::Woke { .. }));
-    let ends = sleeps.iter().skip(1).map(|(from, _)| *from).chain(core.last().map(|deed| deed.to));
-    let awake = sleeps.iter().zip(ends).map(|((_, woke), sleeps)| (*woke, sleeps.max(*woke))).collect();
-    rows.push(row("core is awake", CORE, awake, false));
+    rows.push(row("core is awake", CORE, history.awake(), false));
     rows
 }
 

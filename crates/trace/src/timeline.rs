@@ -157,36 +157,15 @@ fn flush(history: &History<'_>, folds: &mut BTreeMap<usize, Fold>, rows: &mut Ve
 struct Fold {
     from: i64,
     to: i64,
-    /// By the order of their kinds in the line.
-    kinds: BTreeMap<Kind, Sum>,
+    /// By the places of their kinds in the line.
+    kinds: BTreeMap<u8, (Sum, Words)>,
     /// How often each command came, and how many came right behind those.
     commands: BTreeMap<i16, u64>,
     behind: u64,
 }
 
-/// Kinds of deeds in a line, in their order.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Kind {
-    Wakes,
-    Timers,
-    Late,
-    Blocks,
-    Waits,
-    Came,
-    Answered,
-    Alive,
-    Refused,
-    Naks,
-    Wrote,
-    Work,
-    Processor,
-    Looked,
-    Stolen,
-    Frequency,
-    Listened,
-    Edges,
-    Other,
-}
+/// The words for the deeds of a kind.
+type Words = fn(&Sum) -> String;
 
 #[derive(Default)]
 struct Sum {
@@ -196,6 +175,16 @@ struct Sum {
     all: u64,
 }
 
+impl Sum {
+    fn count(&self, thing: &str) -> String {
+        count(self.count, thing)
+    }
+
+    fn most_ms(&self) -> String {
+        ms(self.most)
+    }
+}
+
 impl Fold {
     fn at(from: i64) -> Fold {
         Fold { from, to: from, ..Fold::default() }
@@ -203,30 +192,45 @@ impl Fold {
 
     fn add(&mut self, deed: &Deed) {
         self.to = self.to.max(deed.to);
-        let (kind, amount) = match deed.event {
+        // The place of the kind in the line, the amount, and the words.
+        let (place, amount, words): (u8, u64, Words) = match deed.event {
             Event::Command { id, more } => {
                 *self.commands.entry(id).or_default() += 1;
                 self.behind += u64::from(more);
                 return;
             }
-            Event::Woke { late, .. } => (Kind::Wakes, late.0.into()),
-            Event::Pace { worst, .. } => (Kind::Timers, worst.0.into()),
-            Event::Late { late, .. } => (Kind::Late, late.0.into()),
-            Event::Block(_) => (Kind::Blocks, deed.ticks()),
-            Event::Held | Event::Released => (Kind::Waits, deed.ticks()),
-            Event::BlockIn(_) => (Kind::Came, 0),
-            Event::Answered { .. } => (Kind::Answered, 0),
-            Event::Alive => (Kind::Alive, 0),
-            Event::Refused(_) => (Kind::Refused, 0),
-            Event::Nak => (Kind::Naks, 0),
-            Event::Out(bytes) => (Kind::Wrote, bytes.into()),
-            Event::JobBegan { .. } | Event::JobEnded { .. } => (Kind::Work, deed.ticks()),
-            Event::Processor { waited, .. } => (Kind::Processor, waited.0.into()),
-            Event::Looked { .. } => (Kind::Looked, 0),
-            Event::Stolen(ticks) => (Kind::Stolen, ticks.0.into()),
-            Event::Frequency { mhz, .. } => (Kind::Frequency, mhz.into()),
-            Event::Listened => (Kind::Listened, 0),
-            Event::Edge { .. } => (Kind::Edges, 0),
+            Event::Woke { late, .. } => {
+                (0, late.0.into(), |sum| format!("{}, latest {} ms", sum.count("wake-up"), sum.most_ms()))
+            }
+            Event::Pace { worst, .. } => (1, worst.0.into(), |sum| format!("no timer later than {} ms", sum.most_ms())),
+            Event::Late { late, .. } => {
+                (2, late.0.into(), |sum| format!("{}, at most {} ms", sum.count("late timer"), sum.most_ms()))
+            }
+            Event::Block(_) => (3, deed.ticks(), |sum| {
+                format!("{} begun, longest in the queue {} ms", sum.count("block"), sum.most_ms())
+            }),
+            Event::Held | Event::Released => {
+                (4, deed.ticks(), |sum| format!("{} for a bus, longest {} ms", sum.count("wait"), sum.most_ms()))
+            }
+            Event::BlockIn(_) => (5, 0, |sum| format!("{} from the host", sum.count("block"))),
+            Event::Answered { .. } => (6, 0, |sum| format!("{} answered without the core", sum.count("block"))),
+            Event::Alive => (7, 0, |sum| format!("{} of life of the host's computer", sum.count("sign"))),
+            Event::Refused(_) => (8, 0, |sum| format!("{} of garbage or of blocks sent again", sum.count("refusal"))),
+            Event::Nak => (9, 0, |sum| sum.count("NAK")),
+            Event::Out(bytes) => (10, bytes.into(), |sum| format!("{} to the host", count(sum.all, "byte"))),
+            Event::JobBegan { .. } | Event::JobEnded { .. } => {
+                (11, deed.ticks(), |sum| format!("{}, longest {} ms", sum.count("transfer"), sum.most_ms()))
+            }
+            Event::Processor { waited, .. } => {
+                (12, waited.0.into(), |sum| format!("threads waited {} ms for a processor", ms(sum.all)))
+            }
+            Event::Looked { .. } => (13, 0, |sum| format!("looked {} at the kernel's accounts", sum.count("time"))),
+            Event::Stolen(ticks) => (14, ticks.0.into(), |sum| format!("a hypervisor took {} ms", ms(sum.all))),
+            Event::Frequency { mhz, .. } => {
+                (15, mhz.into(), |sum| format!("the processor runs at up to {} MHz", sum.most))
+            }
+            Event::Listened => (16, 0, |sum| format!("listened {}", sum.count("time"))),
+            Event::Edge { .. } => (17, 0, |sum| sum.count("edge")),
             Event::Omitted(_)
             | Event::Configured
             | Event::Reset
@@ -236,39 +240,16 @@ impl Fold {
             | Event::HostCame
             | Event::HostGone
             | Event::Full
-            | Event::Power(_) => (Kind::Other, 0),
+            | Event::Power(_) => (18, 0, |sum| format!("{} of note", sum.count("other event"))),
         };
-        let sum = self.kinds.entry(kind).or_default();
+        let (sum, _) = self.kinds.entry(place).or_insert((Sum::default(), words));
         sum.count += 1;
         sum.most = sum.most.max(amount);
         sum.all = sum.all.saturating_add(amount);
     }
 
     fn words(&self, history: &History<'_>) -> String {
-        let parts = self.kinds.iter().map(|(kind, sum)| {
-            let (most, all) = (ms(sum.most), ms(sum.all));
-            match kind {
-                Kind::Wakes => format!("{}, latest {most} ms", count(sum.count, "wake-up")),
-                Kind::Timers => format!("no timer later than {most} ms"),
-                Kind::Late => format!("{}, at most {most} ms", count(sum.count, "late timer")),
-                Kind::Blocks => format!("{} begun, longest in the queue {most} ms", count(sum.count, "block")),
-                Kind::Waits => format!("{} for a bus, longest {most} ms", count(sum.count, "wait")),
-                Kind::Came => format!("{} from the host", count(sum.count, "block")),
-                Kind::Answered => format!("{} answered without the core", count(sum.count, "block")),
-                Kind::Alive => format!("{} of life of the host's computer", count(sum.count, "sign")),
-                Kind::Refused => format!("{} of garbage or of blocks sent again", count(sum.count, "refusal")),
-                Kind::Naks => count(sum.count, "NAK"),
-                Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),
-                Kind::Work => format!("{}, longest {most} ms", count(sum.count, "transfer")),
-                Kind::Processor => format!("threads waited {all} ms for a processor"),
-                Kind::Looked => format!("looked {} at the kernel's accounts", count(sum.count, "time")),
-                Kind::Stolen => format!("a hypervisor took {all} ms"),
-                Kind::Frequency => format!("the processor runs at up to {} MHz", sum.most),
-                Kind::Listened => format!("listened {}", count(sum.count, "time")),
-                Kind::Edges => count(sum.count, "edge"),
-                Kind::Other => format!("{} of note", count(sum.count, "other event")),
-            }
-        });
+        let parts = self.kinds.values().map(|(sum, words)| words(sum));
         parts.chain(self.commands(history)).collect::<Vec<_>>().join("; ")
     }
 

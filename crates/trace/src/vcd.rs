@@ -192,8 +192,10 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
         .map(|deed| (deed.from, deed.to, u32::try_from(deed.ticks() / UNIT as u64).unwrap_or(u32::MAX).max(1)))
         .collect();
     let known = first(core);
+    let first_sleep =
+        core.iter().find(|deed| matches!(deed.event, Event::Woke { .. })).map_or(i64::MAX, |deed| deed.from);
     let mut signals = vec![
-        awake(core),
+        Signal::new("core_awake", first_sleep, history.awake().into_iter().map(|(from, to)| (from, to, 1)).collect()),
         Signal::new("core_held", known, when(core, |event| matches!(event, Event::Held | Event::Released))),
         Signal::new("host_block", first(&all), pulses(|event| matches!(event, Event::BlockIn(_)))),
         Signal::new("core_block", known, pulses(|event| matches!(event, Event::Block(_)))),
@@ -226,15 +228,6 @@ fn signals(history: &History<'_>) -> Vec<Signal> {
         Signal::new(&history.pin(output.pin), output.known, highs)
     }));
     signals
-}
-
-/// The core is awake between its sleeps. Its next sleep is not recorded, so the last time is that of its last event.
-fn awake(core: &[Deed]) -> Signal {
-    let sleeps: Vec<&Deed> = core.iter().filter(|deed| matches!(deed.event, Event::Woke { .. })).collect();
-    let known = sleeps.first().map_or(i64::MAX, |deed| deed.from);
-    let ends = sleeps.iter().skip(1).map(|next| next.from).chain(core.last().map(|deed| deed.to));
-    let spans = sleeps.iter().zip(ends).map(|(sleep, end)| (sleep.to, end.max(sleep.to), 1)).collect();
-    Signal::new("core_awake", known, spans)
 }
 
 /// A signal that keeps its level until the next one. It is known from `known` or the first level.

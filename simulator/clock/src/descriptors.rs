@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Waits for descriptors, and the way to the simulated MCUs.
 //!
-//! A read from a descriptor that blocks is not replaced. Real time passes meanwhile, and none of the printer's. klippy
+//! A read from a descriptor that blocks is not replaced. During such a read real time passes, and none of the printer's. klippy
 //! reads so from its children only.
 
 use std::ffi::{CStr, OsStr};

@@ -11,7 +11,7 @@ use crate::children;
 use crate::real::real;
 use crate::turns::{self, NEVER};
 
-/// What a thread waits for.
+/// The event that a thread waits for.
 #[derive(Clone, Copy)]
 pub(crate) enum Wait {
     /// A time only.
@@ -218,7 +218,7 @@ fn await_token(token: &AtomicU32) {
     }
 }
 
-/// Waits, and lets others run meanwhile.
+/// Waits, and lets others run during the wait.
 pub(crate) fn wait(wait: Wait, deadline_ns: u64) -> WakeReason {
     let me = ME.get();
     READINGS.set(0);

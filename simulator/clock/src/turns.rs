@@ -47,7 +47,7 @@ pub(crate) fn read_ns() -> u64 {
     NOW_NS.fetch_add(READ_NS, Ordering::Relaxed) + READ_NS
 }
 
-/// What to add to the printer's time for the time of day.
+/// The difference between the time of day and the printer's time.
 pub(crate) fn wall_ns() -> u64 {
     WALL_NS.load(Ordering::Relaxed)
 }

@@ -27,7 +27,7 @@ const LOOKS: usize = 10;
 /// Highest number of threads that are named.
 const THREADS_MAX: usize = 3;
 
-/// What a klippy that hangs does, and where.
+/// How a klippy hangs, and at which lines.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Hang {
     computes: bool,
@@ -101,7 +101,7 @@ mod tests {
     use std::os::unix::process::CommandExt as _;
     use std::process::{Command, Stdio};
 
-    /// What Python does when it runs a script.
+    /// How a Python hangs that runs a script.
     fn examined(script: &str) -> String {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);

@@ -463,7 +463,7 @@ impl Started {
             Time::One(_) if cfg!(target_pointer_width = "32") => return Err(NoStart::Alone),
             Time::One(clock) => {
                 let (ours, theirs) = clock.invite().map_err(|error| failed(error.to_string()))?;
-                // What follows env, and nothing before it, has the library.
+                // Only programs behind env have the library.
                 let library = library()?;
                 let opened = File::open(&library).and_then(|file| {
                     fcntl(&file, FcntlArg::F_SETFD(FdFlag::empty()))?;

@@ -23,7 +23,7 @@ const INPUT_BYTES_MAX: usize = 1 << 16;
 const OUTPUT_BYTES_MAX: usize = 1 << 20;
 
 /// How long the MCU takes no commands behind `finalize_config`. klippy counts on the time that its start takes: it sets each
-/// output for 0.2 s later, and `[controller_fan]` sets one anew 0.1 s after that start, for 0.1 s later. klippy sends that
+/// output for 0.2 s later, and `[controller_fan]` sets one again 0.1 s after that start, for 0.1 s later. klippy sends that
 /// only after the first time has come, which is too late if the start takes no time at all.
 const CONFIGURES: Ticks = Ticks::from_ms(50);
 
@@ -31,7 +31,7 @@ const CONFIGURES: Ticks = Ticks::from_ms(50);
 /// answers in a row, and that estimate leads astray if they are less than 0.1 ms apart.
 const LINK: Ticks = Ticks::from_us(500);
 
-/// What the MCU sends.
+/// The bytes from the MCU.
 #[derive(Clone, Default)]
 struct Responses(Arc<Mutex<VecDeque<Vec<u8>>>>);
 
@@ -60,7 +60,7 @@ impl Outbox for Responses {
 struct Connection {
     stream: UnixStream,
     receiver: Receiver,
-    /// What klippy has sent, and when it arrives.
+    /// The bytes from klippy, and when they arrive.
     under_way: VecDeque<(Clock, Vec<u8>)>,
     input: Vec<u8>,
     /// The block that is under way, and the offset of its next command.
@@ -153,7 +153,7 @@ impl BoardMcu {
         let arrives = self.clock.now() + LINK;
         while connection.under_way.len() * piece.len() + connection.input.len() < INPUT_BYTES_MAX {
             match connection.stream.read(&mut piece) {
-                // What has come before the end still counts.
+                // Bytes that came before the end still count.
                 Ok(0) => return connection.is_over = true,
                 Ok(read) => connection.under_way.push_back((arrives, piece[..read].to_vec())),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}

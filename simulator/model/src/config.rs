@@ -11,7 +11,7 @@ use super::description::check::{Trouble, no_name, wrong};
 use super::description::heater::{FanConfig, HeaterConfig};
 use super::description::kinematics::KinematicsConfig;
 use super::description::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};
-use super::description::pin::is_word;
+use super::description::pin::is_klippy_name;
 use super::description::printer::Printer;
 use super::part::workshop::{Part, Socket};
 
@@ -214,7 +214,7 @@ impl SimConfig {
         // The description chose the text after the kind. It names a section of printer.cfg.
         let name = part.name();
         match name.split_once(' ') {
-            Some((_, own)) if !is_word(own) => no_name(whose, own),
+            Some((_, own)) if !is_klippy_name(own) => no_name(whose, own),
             _ => Ok(()),
         }
     }
@@ -229,7 +229,7 @@ fn key(text: &str, at: usize) -> Option<&str> {
     if value.contains('\n') && !goes_on {
         return None;
     }
-    keys.trim_end().rsplit([' ', ',', '{', '\n', '\t']).next().filter(|key| is_word(key))
+    keys.trim_end().rsplit([' ', ',', '{', '\n', '\t']).next().filter(|key| is_klippy_name(key))
 }
 
 #[cfg(test)]

@@ -29,7 +29,7 @@ pub use description::buses::{I2cBusConfig, SpiBusConfig};
 pub use description::heater::{FanConfig, HeaterConfig};
 pub use description::kinematics::{DeltesianConfig, KinematicsConfig, NoKeys, RotaryDeltaConfig, WinchConfig};
 pub use description::outputs::{AnalogConfig, InputConfig, LedConfig, OutputConfig};
-pub use description::pin::PinName;
+pub use description::pin::{PinName, is_klippy_name};
 pub use description::thermistor::{NoThermistor, Thermistor};
 pub use engine::bed::{BedShape, Space};
 pub use engine::look::{Colour, Look};

@@ -314,7 +314,7 @@ fn alone(python: &Path) -> Trouble {
         .remedy("name another Python with --python")
 }
 
-/// Starts this program anew, for a trial in real time.
+/// Starts this program again, for a trial in real time.
 fn in_real_time(python: &Path) -> Trouble {
     log::warn!("the trial runs in real time: {} loads no library: name another Python with --python", python.display());
     logging::finish();

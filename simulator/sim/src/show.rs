@@ -94,49 +94,33 @@ struct Number {
 /// All visible things now.
 fn look(probe: &SimProbe, own: &OwnStatus) -> Vec<Item> {
     let state = own.stop().map_or("runs".into(), |stop| format!("SHUT DOWN: {stop}; the log says more"));
+    let item = |kind, name: &str, number, text| Item { kind, name: name.into(), number, text }.plain();
+    let moving = |value, step, ripple| Some(Number { value, step, ripple });
     // It is the first: a small terminal shows only the first lines.
-    let mut items = vec![Item { kind: Kind::Part, name: "mcu".into(), number: None, text: state }];
-    for axis in probe.axes() {
+    let mut items = vec![item(Kind::Part, "mcu", None, state)];
+    items.extend(probe.axes().map(|axis| {
         let lost = if axis.lost_steps > 0 { format!(" ({} steps lost)", axis.lost_steps) } else { String::new() };
         // A value next to zero must not be "-0.00".
         let mm = (axis.position_mm * 100.0).round() / 100.0 + 0.0;
-        items.push(Item {
-            kind: Kind::Axis,
-            name: axis.name.into(),
-            number: Some(Number { value: axis.position_mm, step: 1.0, ripple: 0.0 }),
-            text: format!("{mm:.2} mm{lost}"),
-        });
-    }
-    for heater in probe.heaters() {
-        items.push(Item {
-            kind: Kind::Heater,
-            name: heater.name.into(),
-            number: Some(Number { value: heater.celsius, step: 1.0, ripple: 0.0 }),
-            text: format!("{:.1} C", heater.celsius),
-        });
-    }
-    for fan in probe.fans() {
-        items.push(Item {
-            kind: Kind::Fan,
-            name: fan.name.into(),
-            // klippy's cycle of 10 ms makes a fan at half speed go up and down by 28 rpm.
-            number: Some(Number { value: fan.rpm, step: 100.0, ripple: 30.0 }),
-            text: format!("{:.0} rpm", fan.rpm),
-        });
-    }
-    for output in probe.outputs() {
+        item(Kind::Axis, axis.name, moving(axis.position_mm, 1.0, 0.0), format!("{mm:.2} mm{lost}"))
+    }));
+    items.extend(probe.heaters().map(|heater| {
+        item(Kind::Heater, heater.name, moving(heater.celsius, 1.0, 0.0), format!("{:.1} C", heater.celsius))
+    }));
+    // klippy's cycle of 10 ms makes a fan at half speed go up and down by 28 rpm.
+    items.extend(
+        probe.fans().map(|fan| item(Kind::Fan, fan.name, moving(fan.rpm, 100.0, 30.0), format!("{:.0} rpm", fan.rpm))),
+    );
+    items.extend(probe.outputs().map(|output| {
         let text = match (output.brightness * 100.0).round() {
             percent if percent < 1.0 => "off".into(),
             percent if percent > 99.0 => "on".into(),
             percent => format!("{percent} %"),
         };
-        let number = Some(Number { value: output.brightness, step: 0.05, ripple: 0.0 });
-        items.push(Item { kind: Kind::Output, name: output.name.into(), number, text });
-    }
-    for (name, look) in probe.sights() {
-        items.push(Item { kind: Kind::Part, name: name.into(), number: None, text: look.to_string() });
-    }
-    items.into_iter().map(Item::plain).collect()
+        item(Kind::Output, output.name, moving(output.brightness, 0.05, 0.0), text)
+    }));
+    items.extend(probe.sights().map(|(name, look)| item(Kind::Part, name, None, look.to_string())));
+    items
 }
 
 /// Writes a text, and lets `with` write each `#rrggbb` in it.
@@ -246,7 +230,7 @@ impl Screen {
             _ => lines.len(),
         };
         if self.placed != Some((size, picture_rows)) {
-            // A terminal that changes its size moves what it shows, and wraps it anew. Only the cursor still shows
+            // A terminal that changes its size moves its text, and wraps it again. Only the cursor still shows
             // where the log ends: the picture is below it, wherever that is. Its rows are deleted, because some
             // terminals keep erased ones in their history and show them again when they grow.
             out += &format!("{SAVE_CURSOR}{}{RESTORE_CURSOR}{DELETE_BELOW}", scrolling(usize::MAX));

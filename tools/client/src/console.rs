@@ -20,7 +20,7 @@ const NAMES_SHOWN: usize = 40;
 /// The console's own commands, with their help texts.
 const OWN: &[(&str, &str)] = &[
     ("help", "help [COMMAND]: list the commands, or the parameters of a command"),
-    ("delay", "delay SECONDS: wait, and print what comes meanwhile"),
+    ("delay", "delay SECONDS: wait, and print the responses that come"),
     ("reset", "reset: drop the configuration and start again, as FIRMWARE_RESTART does"),
     ("stats", "stats: turn the MCU's statistics on or off"),
     ("quit", "quit: end (also Ctrl-D)"),

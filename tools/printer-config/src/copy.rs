@@ -64,7 +64,7 @@ pub fn write(config: &Config, changes: &[Change], folder: &Path) -> Result<PathB
     Ok(folder.join(&places[&main]))
 }
 
-/// Writes a copy anew, with the permissions of its source, which may have secrets.
+/// Writes a copy again, with the permissions of its source, which may have secrets.
 ///
 /// # Errors
 ///

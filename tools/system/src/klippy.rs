@@ -43,7 +43,7 @@ pub struct Klippy {
 
 impl Klippy {
     /// The command that installs numpy for a klippy that has none. `None` also if that is not known.
-    pub fn without_numpy(&self, computer: &Computer) -> Option<String> {
+    pub fn install_numpy(&self, computer: &Computer) -> Option<String> {
         let python = self.python.as_deref().filter(|python| computer.exists(python))?;
         // A virtual environment has its packages beside its Python. It may also use the system's.
         let home = python.parent()?.parent()?;
@@ -66,8 +66,8 @@ impl Klippy {
         Some(format!("sudo -u {} {} install numpy", word(&self.who.name), word(pip.display())))
     }
 
-    /// Its folder, if that lacks this module. `None` also if it cannot be read.
-    pub fn lacks(&self, module: &str) -> Option<PathBuf> {
+    /// Its folder, if this module is missing there. `None` also if it cannot be read.
+    pub fn folder_without(&self, module: &str) -> Option<PathBuf> {
         let folder = self.folder.as_ref().filter(|folder| has_module(folder, "bus") && !has_module(folder, module));
         folder.cloned()
     }

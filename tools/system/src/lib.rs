@@ -6,7 +6,7 @@
 //!
 //! - [`board`]: the boards that are known, with their headers
 //! - [`units`], [`manager`], [`running`]: what systemd starts, its settings, the processes
-//! - [`instance`], [`settings`], [`config`]: the Pinions, and what each was told to do
+//! - [`instance`], [`settings`], [`config`]: the Pinions, and the settings of each
 //! - [`klippy`], [`printer`]: the klippys, and their configurations
 //! - [`device`], [`rights`], [`mod@files`]: files in /dev, the rights of a file's owner, files that a command line names
 

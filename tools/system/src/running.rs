@@ -151,7 +151,7 @@ impl Computer {
         }
     }
 
-    /// Whether a unit starts one of these programs, so that a restart of the unit starts it anew. Any user may have
+    /// Whether a unit starts one of these programs, so that a restart of the unit starts it again. Any user may have
     /// processes in other units, such as cron's.
     fn starts(&self, unit: &str, programs: &[&str]) -> bool {
         // systemd makes some units without a file in these folders, from scripts of System V. Then the name counts.
@@ -217,7 +217,7 @@ pub fn print_at_risk(computer: &Computer) -> Option<String> {
             None => format!("end process {}", host.pid),
         };
         Some(format!(
-            "{name} (process {}) {is} attached to {who}, and measuring keeps every processor busy, which makes steps late: wait until the print is done, then {stop}; pinion doctor measures gently meanwhile",
+            "{name} (process {}) {is} attached to {who}, and measuring keeps every processor busy, which makes steps late: wait until the print is done, then {stop}; pinion doctor measures gently",
             host.pid
         ))
     })

@@ -64,6 +64,23 @@ pub enum Bias {
     PullDown,
 }
 
+/// The value of an output in a stopped MCU, and after the death of the program. The MCU's table of claims makes it
+/// (`mcu/claims.rs`). Line, guardian and object all have this one. Other code can only make the value of an output that
+/// goes off (the default), or that [stays at its level](Direction::at_rest).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ShutdownValue<T>(T);
+
+impl<T: Copy> ShutdownValue<T> {
+    pub(crate) fn new(value: T) -> ShutdownValue<T> {
+        ShutdownValue(value)
+    }
+
+    /// The value itself.
+    pub fn get(self) -> T {
+        self.0
+    }
+}
+
 /// Whether a claimed GPIO line is an output or an input, and its setup.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
@@ -72,7 +89,7 @@ pub enum Direction {
         /// The level when it becomes an output.
         level: bool,
         /// The level when the MCU stops or the program dies.
-        shutdown_value: bool,
+        shutdown_value: ShutdownValue<bool>,
     },
     /// The line is read. It is an error if the chip does not have this resistor.
     Input(Bias),
@@ -80,6 +97,18 @@ pub enum Direction {
     /// states. It begins released. It has a pull-up, except on chips known to have none. The guardian does not handle
     /// it.
     OpenDrain,
+}
+
+impl Direction {
+    /// An output whose level now is also its level when the MCU stops or the program dies.
+    pub const fn at_rest(level: bool) -> Direction {
+        Direction::Output { level, shutdown_value: ShutdownValue(level) }
+    }
+
+    /// The shutdown value of an output.
+    pub fn shutdown_value(self) -> Option<ShutdownValue<bool>> {
+        if let Direction::Output { shutdown_value, .. } = self { Some(shutdown_value) } else { None }
+    }
 }
 
 /// Lines whose levels one store can change together. A claimed line says if it is in one ([`Line::bank`]).
@@ -379,7 +408,7 @@ pub struct PwmConfig {
     /// The first value.
     pub value: u16,
     /// The value when the program dies.
-    pub shutdown_value: u16,
+    pub shutdown_value: ShutdownValue<u16>,
 }
 
 /// An SPI device's parameters.

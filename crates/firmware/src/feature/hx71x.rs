@@ -235,7 +235,7 @@ fn configure(
     }
     let dout = context.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
-    let sclk = context.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
+    let sclk = context.prompt_line(sclk_pin, "sclk", Direction::at_rest(true))?;
     // A call of the kernel takes about as long as a watcher waits.
     let is_watched = sclk.is_fast() && context.has_parallel_workers();
     let watcher = is_watched.then(|| Watcher::new(context, sclk.clone()));

@@ -19,6 +19,7 @@ mod display;
 mod ds18b20;
 mod endstop;
 #[cfg(test)]
+#[path = "../../tests/example/mod.rs"]
 mod example;
 mod fifo_sensor;
 mod hd44780;

@@ -139,7 +139,7 @@ fn way(
     reset: Ticks,
 ) -> Result<DeviceId<Interface>, Shutdown> {
     let Some(mosi) = context.board()?.mosi(pin, spi::RATE_HZ)? else {
-        let line = context.prompt_line(pin, "LED", Direction::Output { level: false, shutdown_value: false })?;
+        let line = context.prompt_line(pin, "LED", Direction::at_rest(false))?;
         let pulses = Pulses::new(context, pin, line, size, bit_max, reset)?;
         return context.device(line::WORKER, Box::new(Interface::Line(pulses)));
     };

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
+use crate::board::{BusDevice, BusError, I2cConfig, OnWorker, ShutdownValue};
 use crate::mcu::{
     BusCounts, Calls, Command, Constant, Context, Device, Feature, Finished, Next, Object, Oid, Remote, Safe, Settable,
     Timer, WireClock, command,
@@ -155,7 +155,7 @@ impl Settable for Pca {
 /// An output on the worker of its bus.
 struct Output {
     remote: Remote<Pca>,
-    shutdown_value: u16,
+    shutdown_value: ShutdownValue<u16>,
     /// Whether the output was ever set.
     is_used: bool,
     /// Whether the shutdown value is still being written.
@@ -220,7 +220,12 @@ impl Chips {
             // There are 256 outputs at most.
             let number = self.outputs.len() as u8;
             let remote = Remote::new(number, chip, Setting { channel, value: Value::SetUp });
-            self.outputs.push(Output { remote, shutdown_value: 0, is_used: false, is_pending: false });
+            self.outputs.push(Output {
+                remote,
+                shutdown_value: ShutdownValue::default(),
+                is_used: false,
+                is_pending: false,
+            });
         }
         Ok(())
     }
@@ -263,7 +268,7 @@ impl Object for Chips {
         let mut safe = Safe::Now;
         for (place, output) in self.outputs.iter_mut().enumerate().filter(|(_, output)| output.is_used) {
             output.is_pending = true;
-            let value = Value::AtShutdown(output.shutdown_value);
+            let value = Value::AtShutdown(output.shutdown_value.get());
             output.remote.set(context, Setting { channel: (place % CHANNELS) as u8, value })?;
             safe = Safe::Later;
         }
@@ -333,15 +338,15 @@ const CONFIG_PCA9685: Command = command!(
             let cause = format_args!("failures of {device} are tolerated, but outputs are not read");
             return Err(Shutdown::because(NOT_SET_UP, cause.to_string()).remedy("remove it from tolerate"));
         }
-        let own = context.own::<Chips>();
+        let (own, shutdown_value) = (context.own::<Chips>(), context.unguarded(default_value));
         let place = context.with::<Chips, _>(own, |chips, context| {
             let place = chips.output(context, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
-            chips.outputs[place].shutdown_value = default_value;
+            chips.outputs[place].shutdown_value = shutdown_value;
             let setting = if value == 0 { Value::SetUp } else { Value::Of(value) };
             chips.set(context, place, setting)?;
             Ok(place)
         })?;
-        context.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
+        context.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(shutdown_value, max_duration, &TEXTS) })
     }
 );
 

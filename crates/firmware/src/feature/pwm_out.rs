@@ -2,7 +2,7 @@
 //! Hardware PWM outputs: queued values, and `max_duration`. `max_duration` limits how long an output may differ from
 //! its shutdown value without news from the host.
 
-use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
+use crate::board::{OnWorker, PWM_MAX, Pin, Pwm};
 use crate::mcu::{
     BusCounts, Calls, Command, Constant, Context, Feature, Finished, Next, Object, Oid, Present, Remote, Report, Safe,
     Settable, Timer, WireClock, command,
@@ -55,12 +55,16 @@ impl Settable for Channel {
     }
 }
 
-/// Opens a channel. As in Klipper's C, several objects may have the same channel, each with its own files.
-fn open(context: &mut Context, number: u8, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
-    let OnWorker { bus, device: pwm } = context.board()?.pwm(config)?;
+/// Lets a worker set a channel, which is at `value`.
+fn on_worker(
+    context: &mut Context,
+    number: u8,
+    OnWorker { bus, device: pwm }: OnWorker<dyn Pwm>,
+    value: u16,
+) -> Result<(Remote<Channel>, Calls), Shutdown> {
     let calls = Calls::new(context.clock());
     let channel = context.device(&bus, Box::new(Channel { pwm, calls: calls.clone() }))?;
-    Ok((Remote::new(number, channel, Setting { value: config.value, cycle: None }), calls))
+    Ok((Remote::new(number, channel, Setting { value, cycle: None }), calls))
 }
 
 const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM };
@@ -121,8 +125,7 @@ struct SetChannels(Vec<(Pin, Remote<Channel>)>);
 impl SetChannels {
     /// Sets a channel. The channel stays open. As with `set_digital_out`, an open channel may be set again at any time.
     /// A new one is refused after `finalize_config`.
-    fn set(&mut self, context: &mut Context, config: PwmConfig) -> Result<(), Shutdown> {
-        let PwmConfig { pin, cycle, value, .. } = config;
+    fn set(&mut self, context: &mut Context, pin: Pin, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
             Some(place) if context.is_finalized() => {
@@ -130,16 +133,17 @@ impl SetChannels {
                 self.0[place].1.set(context, setting)
             }
             _ if context.is_finalized() => Err(set_too_late(context, reason::PWM_CONFIG, "set_pwm_out", pin)),
-            Some(place) => {
-                self.0[place].1 = open(context, place as u8, config)?.0;
-                Ok(())
-            }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
             }
-            None => {
-                let number = self.0.len() as u8;
-                self.0.push((pin, open(context, number, config)?.0));
+            _ => {
+                let (channel, _) = context.pwm(pin, cycle, value, value)?;
+                let place = known.unwrap_or(self.0.len());
+                let (channel, _) = on_worker(context, place as u8, channel, value)?;
+                match self.0.get_mut(place) {
+                    Some(known) => known.1 = channel,
+                    None => self.0.push((pin, channel)),
+                }
                 Ok(())
             }
         }
@@ -161,9 +165,9 @@ const CONFIG_PWM_OUT: Command = command!(
     "config_pwm_out oid=%c pin=%u cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
     |context, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         context.vacant(oid)?;
-        let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
-        let (channel, calls) = open(context, 0, config)?;
-        let queue = ValueQueue::new(default_value, max_duration, &TEXTS);
+        let (channel, shutdown_value) = context.pwm(pin, cycle_ticks, value, default_value)?;
+        let (channel, calls) = on_worker(context, 0, channel, value)?;
+        let queue = ValueQueue::new(shutdown_value, max_duration, &TEXTS);
         context.assign_on(pin, oid, PwmOut { channel, calls, value, queue })
     }
 );
@@ -177,6 +181,5 @@ const QUEUE_PWM_OUT: Command =
 const SET_PWM_OUT: Command =
     command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |context, pin: Pin, cycle_ticks: Ticks, value: u16| {
         let oid = context.own::<SetChannels>();
-        let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value };
-        context.with::<SetChannels, _>(oid, |channels, context| channels.set(context, config))
+        context.with::<SetChannels, _>(oid, |channels, context| channels.set(context, pin, cycle_ticks, value))
     });

@@ -210,8 +210,7 @@ fn lines(context: &mut Context, rx_pin: Pin, tx_pin: Pin, bias: Bias, bit: Ticks
     let (tx, single) = if rx_pin == tx_pin {
         (rx.clone(), Some(bias))
     } else {
-        let idle = Direction::Output { level: true, shutdown_value: true };
-        (context.prompt_line(tx_pin, "UART", idle)?, None)
+        (context.prompt_line(tx_pin, "UART", Direction::at_rest(true))?, None)
     };
     let lines = Lines { wire: Wire { tx, single }, rx, pace: Pace::new(context), bit, spoilt: false };
     lines.wire.idle()?;

@@ -2,6 +2,7 @@
 //! Queued values of an output, and `max_duration`. `max_duration` limits how long the output may differ from its
 //! shutdown value without news from the host. Hardware PWM channels and PCA9685 share this code.
 
+use crate::board::ShutdownValue;
 use crate::mcu::{Context, MoveQueue, Next, Timer};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::{Clock, Ticks};
@@ -25,7 +26,7 @@ pub(super) struct Texts {
 
 /// The values of an output. The object has no timer except the queue's.
 pub(super) struct ValueQueue {
-    shutdown_value: u16,
+    shutdown_value: ShutdownValue<u16>,
     max_duration: Ticks,
     texts: &'static Texts,
     queue: MoveQueue<Move>,
@@ -34,13 +35,13 @@ pub(super) struct ValueQueue {
 }
 
 impl ValueQueue {
-    pub(super) fn new(shutdown_value: u16, max_duration: Ticks, texts: &'static Texts) -> ValueQueue {
+    pub(super) fn new(shutdown_value: ShutdownValue<u16>, max_duration: Ticks, texts: &'static Texts) -> ValueQueue {
         ValueQueue { shutdown_value, max_duration, texts, queue: MoveQueue::default(), end: None }
     }
 
     /// The value in a stopped MCU.
     pub(super) fn shutdown_value(&self) -> u16 {
-        self.shutdown_value
+        self.shutdown_value.get()
     }
 
     /// How many values are queued.
@@ -70,7 +71,7 @@ impl ValueQueue {
 
     /// When the timer runs next, after the output got a value that was due at `at`.
     pub(super) fn next(&mut self, value: u16, at: Clock) -> Result<Next, Shutdown> {
-        let limited = value != self.shutdown_value && self.max_duration.0 != 0;
+        let limited = value != self.shutdown_value() && self.max_duration.0 != 0;
         let end = limited.then(|| at + self.max_duration);
         let Some(next) = self.queue.first().map(|next| next.at) else {
             self.end = end;

@@ -11,10 +11,11 @@
 
 use std::sync::Arc;
 
-use crate::board::{ClaimedLine, Direction, Line, Pin};
+use crate::board::{ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, ShutdownValue};
 use crate::shutdown::Shutdown;
+use crate::time::Ticks;
 
-use super::level::{Level, Recorded, Repeated, Watched};
+use super::level::{JobLine, Level, Recorded};
 use super::stop::Subject;
 use super::{Calls, Context, DeviceId, LineState, Oid, Remote, State};
 
@@ -58,7 +59,7 @@ pub(super) struct Claim {
     pin: Pin,
     line: Arc<dyn Line>,
     /// The line in the worker of its chip and the worker's calls, if calls to that chip may be slow.
-    slow: Option<(DeviceId<Repeated>, Calls)>,
+    slow: Option<(DeviceId<JobLine>, Calls)>,
     /// Its last setup, with the shutdown value of an output.
     direction: Direction,
     level: Arc<Level>,
@@ -86,13 +87,13 @@ impl Claim {
     }
 
     /// The level to which a stop of the MCU drives the line. `None` if a stop leaves it.
-    pub(super) fn value_at_stop(&self) -> Option<bool> {
+    pub(super) fn value_at_stop(&self) -> Option<ShutdownValue<bool>> {
         self.shutdown_value().filter(|_| self.output.as_ref().is_some_and(Output::is_driven_at_stop))
     }
 
     /// The level of an output in a stopped MCU.
-    pub(super) fn shutdown_value(&self) -> Option<bool> {
-        if let Direction::Output { shutdown_value, .. } = self.direction { Some(shutdown_value) } else { None }
+    pub(super) fn shutdown_value(&self) -> Option<ShutdownValue<bool>> {
+        self.direction.shutdown_value()
     }
 
     /// Drives the line from the core.
@@ -103,7 +104,7 @@ impl Claim {
     }
 
     /// The line in the worker of its chip, if calls to that chip may be slow.
-    pub(super) fn slow(&self) -> Option<DeviceId<Repeated>> {
+    pub(super) fn slow(&self) -> Option<DeviceId<JobLine>> {
         self.slow.as_ref().map(|(line, _)| *line)
     }
 
@@ -114,11 +115,8 @@ impl Claim {
 
     /// The line for a user that calls it directly, for example a job.
     pub(super) fn shared(&self) -> Arc<dyn Line> {
-        let line = Arc::new(Watched { line: self.line.clone(), level: self.level.clone() });
-        match &self.slow {
-            None => line,
-            Some((_, calls)) => Arc::new(Repeated { line, calls: calls.clone() }),
-        }
+        let calls = self.slow.as_ref().map(|(_, calls)| calls.clone());
+        Arc::new(JobLine { line: self.line.clone(), level: self.level.clone(), calls })
     }
 }
 
@@ -129,7 +127,7 @@ pub(super) struct Output {
     /// Whether a stop of the MCU leaves its level.
     is_kept: bool,
     /// Writes the line, if its chip may be slow. `None` also while it runs.
-    writer: Option<Remote<Repeated>>,
+    writer: Option<Remote<JobLine>>,
 }
 
 impl Output {
@@ -148,7 +146,7 @@ impl Output {
     }
 
     /// Lets a worker write the line, which is at `level`.
-    fn give_writer(&mut self, place: usize, line: DeviceId<Repeated>, level: bool) {
+    fn give_writer(&mut self, place: usize, line: DeviceId<JobLine>, level: bool) {
         self.writer.get_or_insert_with(|| Remote::of_output(place, line, level));
     }
 }
@@ -206,9 +204,8 @@ impl State {
             None => None,
             Some(chip) => {
                 let calls = Calls::new(self.scheduler.clock());
-                let watched = Arc::new(Watched { line: line.clone(), level: level.clone() });
-                let line = Box::new(Repeated { line: watched, calls: calls.clone() });
-                Some((self.device(&chip, line)?, calls))
+                let own = JobLine { line: line.clone(), level: level.clone(), calls: Some(calls.clone()) };
+                Some((self.device(&chip, Box::new(own))?, calls))
             }
         };
         level.begin(direction);
@@ -221,7 +218,7 @@ impl State {
     pub(super) fn with_writer<R>(
         &mut self,
         place: usize,
-        f: impl FnOnce(&mut Remote<Repeated>, &mut Context) -> R,
+        f: impl FnOnce(&mut Remote<JobLine>, &mut Context) -> R,
     ) -> Option<R> {
         let output = self.lines.output_mut(place)?;
         let (owner, mut writer) = (output.owner, output.writer.take()?);
@@ -254,16 +251,41 @@ impl Context<'_> {
     pub(super) fn claim_output(
         &mut self,
         pin: Pin,
-        direction: Direction,
+        level: bool,
+        shutdown_value: bool,
         is_kept: bool,
     ) -> Result<(usize, &mut Claim), Shutdown> {
         self.board()?;
         let output = Output::of(self.oid(), is_kept);
+        let direction = Direction::Output { level, shutdown_value: ShutdownValue::new(shutdown_value) };
         let (place, claim) = self.state.claim(pin, direction, Some(output))?;
         let slow = claim.slow();
         if let (Some(output), Some(line)) = (&mut claim.output, slow) {
             output.give_writer(place, line, claim.level.is_high());
         }
         Ok((place, claim))
+    }
+
+    /// Claims a hardware PWM output, and returns its shutdown value for the object that writes it at a stop. As in
+    /// Klipper's C, several objects may have one channel.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
+    pub fn pwm(
+        &mut self,
+        pin: Pin,
+        cycle: Ticks,
+        value: u16,
+        shutdown_value: u16,
+    ) -> Result<(OnWorker<dyn Pwm>, ShutdownValue<u16>), Shutdown> {
+        let shutdown_value = ShutdownValue::new(shutdown_value);
+        let channel = self.board()?.pwm(PwmConfig { pin, cycle, value, shutdown_value })?;
+        Ok((channel, shutdown_value))
+    }
+
+    /// The shutdown value of an output that the guardian cannot set: only its object writes it.
+    pub fn unguarded(&self, shutdown_value: u16) -> ShutdownValue<u16> {
+        ShutdownValue::new(shutdown_value)
     }
 }

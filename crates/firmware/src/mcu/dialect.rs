@@ -17,7 +17,7 @@ use super::forms::{Entry, Item, Part, entries};
 use super::{DialectName, Forms, Wire, base};
 
 /// The remedy for a host with another dictionary.
-pub(super) const READ_ANEW: &str = "restart the host: it then reads the dictionary again";
+pub(super) const READ_AGAIN: &str = "restart the host, and it reads the dictionary again";
 
 /// A command of the dialect, found by its id.
 pub(super) struct Known {
@@ -335,7 +335,7 @@ impl Dialect {
             Some(Some(entry)) => Ok(entry),
             _ => {
                 let cause = format!("the host sent command {}, which the dictionary does not have", id as i32);
-                Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy(READ_ANEW))
+                Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy(READ_AGAIN))
             }
         }
     }

@@ -54,7 +54,7 @@ pub enum Item {
 
 /// An entry of the dictionary: a form of a message, a constant or an enumeration.
 pub struct Entry {
-    /// What it is.
+    /// Its kind.
     pub item: Item,
     /// Its name.
     pub name: &'static str,
@@ -81,7 +81,7 @@ impl Entry {
         matches!(self.item, Item::Response(_) | Item::Command(_))
     }
 
-    /// What a dictionary has only one of.
+    /// The key of the entry. A dictionary has each key once.
     fn key(&self) -> (Discriminant<Item>, &'static str) {
         (discriminant(&self.item), self.name)
     }

@@ -8,18 +8,18 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
 use super::claims::Claim;
-use super::level::{Level, Repeated};
+use super::level::{JobLine, Level};
 use super::{Back, Context, DeviceId, Finished, Job, JobSlot, UNREAD_LIMIT, Unread};
 
 /// Reads an input of a chip that may sleep.
 struct Read;
 
 impl Job for Read {
-    type Device = Repeated;
+    type Device = JobLine;
     type Out = bool;
     type Failure = Shutdown;
 
-    fn run(&mut self, line: &mut Repeated) -> Result<bool, Shutdown> {
+    fn run(&mut self, line: &mut JobLine) -> Result<bool, Shutdown> {
         line.read()
     }
 }
@@ -43,7 +43,7 @@ pub struct InputLine {
 
 enum Sensor {
     Prompt(Arc<dyn Line>),
-    Slow { line: DeviceId<Repeated>, read: JobSlot<Read>, unread: Unread },
+    Slow { line: DeviceId<JobLine>, read: JobSlot<Read>, unread: Unread },
 }
 
 impl InputLine {

@@ -136,33 +136,44 @@ impl Line for Recorded {
     }
 }
 
-/// A line that records its level for the status when a job drives or reads it. Jobs measure the time between
+/// A line for jobs. It records its level for the status when a job drives or reads it. Jobs measure the time between
 /// edges, so a write returns when it has reached the line.
-pub(super) struct Watched {
+pub(super) struct JobLine {
     pub(super) line: Arc<dyn Line>,
     pub(super) level: Arc<Level>,
+    /// Repeats the calls to a chip that may sleep.
+    pub(super) calls: Option<Calls>,
 }
 
-impl Line for Watched {
+impl JobLine {
+    fn call<T>(&self, call: impl Fn(&dyn Line) -> Result<T, Shutdown>) -> Result<T, Shutdown> {
+        match &self.calls {
+            None => call(&*self.line),
+            Some(calls) => calls.repeat(|| call(&*self.line)),
+        }
+    }
+}
+
+impl Line for JobLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
-        self.line.write(level)?;
+        self.call(|line| line.write(level))?;
         self.line.flush();
         self.level.set(level);
         Ok(())
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
-        self.line.read().inspect(|level| self.level.set(*level))
+        self.call(|line| line.read()).inspect(|level| self.level.set(*level))
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.line.set_direction(direction)?;
+        self.call(|line| line.set_direction(direction))?;
         self.level.begin(direction);
         Ok(())
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.line.turn(direction)?;
+        self.call(|line| line.turn(direction))?;
         self.level.begin(direction);
         Ok(())
     }
@@ -176,32 +187,7 @@ impl Line for Watched {
     }
 }
 
-/// A line of a chip that may sleep. Each call may be repeated.
-#[derive(Clone)]
-pub(super) struct Repeated {
-    pub(super) line: Arc<dyn Line>,
-    pub(super) calls: Calls,
-}
-
-impl Line for Repeated {
-    fn write(&self, level: bool) -> Result<(), Shutdown> {
-        self.calls.repeat(|| self.line.write(level))
-    }
-
-    fn read(&self) -> Result<bool, Shutdown> {
-        self.calls.repeat(|| self.line.read())
-    }
-
-    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.calls.repeat(|| self.line.set_direction(direction))
-    }
-
-    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
-        self.calls.repeat(|| self.line.turn(direction))
-    }
-}
-
-impl Settable for Repeated {
+impl Settable for JobLine {
     type Value = bool;
 
     fn set(&mut self, level: bool) -> Result<(), Shutdown> {

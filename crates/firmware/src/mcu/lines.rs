@@ -32,7 +32,7 @@ impl Context<'_> {
     ///
     /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn output(&mut self, pin: Pin, level: bool, shutdown_value: bool) -> Result<OutputLine, Shutdown> {
-        let (place, claim) = self.claim_output(pin, Direction::Output { level, shutdown_value }, false)?;
+        let (place, claim) = self.claim_output(pin, level, shutdown_value, false)?;
         Ok(OutputLine::new(place, claim))
     }
 
@@ -42,7 +42,7 @@ impl Context<'_> {
     ///
     /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn kept_output(&mut self, pin: Pin, level: bool) -> Result<OutputLine, Shutdown> {
-        let (place, claim) = self.claim_output(pin, Direction::Output { level, shutdown_value: level }, true)?;
+        let (place, claim) = self.claim_output(pin, level, level, true)?;
         Ok(OutputLine::new(place, claim))
     }
 
@@ -53,11 +53,10 @@ impl Context<'_> {
     ///
     /// The board's errors, and "Unable to open out GPIO chip line" for a chip that may sleep.
     pub fn prompt_output(&mut self, pin: Pin, use_: &str, idle: bool, is_kept: bool) -> Result<PromptLine, Shutdown> {
-        let direction = Direction::Output { level: idle, shutdown_value: idle };
-        let (_, claim) = self.claim_output(pin, direction, is_kept)?;
+        let (_, claim) = self.claim_output(pin, idle, idle, is_kept)?;
         if claim.slow().is_some() {
             claim.drop_output();
-            return Err(too_slow(&self.name(pin), use_, direction));
+            return Err(too_slow(&self.name(pin), use_, Direction::at_rest(idle)));
         }
         Ok(PromptLine::new(claim))
     }
@@ -82,7 +81,7 @@ impl Context<'_> {
     ///
     /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn shared_output(&mut self, pin: Pin, level: bool) -> Result<Arc<dyn Line>, Shutdown> {
-        self.claim(pin, Direction::Output { level, shutdown_value: level }).map(Claim::shared)
+        self.claim(pin, Direction::at_rest(level)).map(Claim::shared)
     }
 
     /// Claims an input that workers read, with a pull-up if the board allows one.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::shutdown::{Shutdown, reason};
 use pinion_protocol::vlq::{Reader, Writer};
 
-use super::dialect::READ_ANEW;
+use super::dialect::READ_AGAIN;
 use super::{Dialect, Mcu, Note, Outbox, Response, State, base};
 
 /// The way to the host and to the log.
@@ -108,7 +108,7 @@ impl Mcu {
         let id = command.int().ok();
         let format = id.and_then(|id| self.heard().command(id).ok()).map_or("a command's id", |entry| entry.format);
         Shutdown::because(reason::COMMAND_PARSER, format!("a message ends in the middle of \"{format}\""))
-            .remedy(READ_ANEW)
+            .remedy(READ_AGAIN)
     }
 
     #[inline]

@@ -4,7 +4,7 @@
 use std::mem;
 use std::sync::Arc;
 
-use crate::board::Line;
+use crate::board::{Line, ShutdownValue};
 use crate::shutdown::Shutdown;
 
 use super::claims::Claim;
@@ -40,7 +40,7 @@ impl OutputLine {
 
     /// The line's level in a stopped MCU.
     pub fn shutdown_value(&self, context: &Context) -> bool {
-        context.state.lines.get(self.place).and_then(Claim::shutdown_value).unwrap_or_default()
+        context.state.lines.get(self.place).and_then(Claim::shutdown_value).unwrap_or_default().get()
     }
 }
 
@@ -126,7 +126,7 @@ impl State {
     /// Drives an output to its shutdown value, unless it keeps its level.
     pub(super) fn make_output_safe(&mut self, place: usize) {
         let Some(claim) = self.lines.get(place) else { return };
-        let Some(value) = claim.value_at_stop() else { return };
+        let Some(value) = claim.value_at_stop().map(ShutdownValue::get) else { return };
         let safe = match claim.slow() {
             None => claim.write(value).map(|()| Safe::Now),
             Some(_) => self.write_output(place, value).map(|()| Safe::Later),

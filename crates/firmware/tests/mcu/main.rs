@@ -33,6 +33,7 @@ mod ready_adc;
 mod remedies;
 mod renew;
 mod safe_ends;
+mod shutdown_values;
 mod sleeping_lines;
 mod snapshot;
 mod software_buses;

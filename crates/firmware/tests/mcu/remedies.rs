@@ -161,7 +161,7 @@ fn bytes_that_are_no_command_are_named() {
     assert_eq!(
         rig.notes(),
         [
-            "shutdown: Invalid command: the host sent command 4095, which the dictionary does not have: restart the host: it then reads the dictionary again"
+            "shutdown: Invalid command: the host sent command 4095, which the dictionary does not have: restart the host, and it reads the dictionary again"
         ]
     );
     let mut rig = Rig::new();

@@ -153,7 +153,7 @@ fn serial_bits_are_klippys() {
 fn a_single_wire_is_driven_but_while_it_listens() {
     let mut rig = Rig::configured(&[ONE_WIRE]);
     let direction = |rig: &Rig| rig.bench.state().directions[&TX];
-    let idle = Direction::Output { level: true, shutdown_value: true };
+    let idle = Direction::at_rest(true);
     assert_eq!(direction(&rig), idle);
     rig.bench.state().turns.clear();
     rig.bench.script_input(TX, &speak(IFCNT, QUIET + 72 * BIT, 1250.0));

@@ -46,6 +46,7 @@ use nix::sys::time::{TimeVal, TimeValLike as _};
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::{Pid, getpid};
 
+use pinion_firmware::board::ShutdownValue;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::Guard;
 use pinion_linux::clock::{monotonic, wait_until};
@@ -217,8 +218,14 @@ fn answer(socket: &OwnedFd) -> io::Result<bool> {
 }
 
 impl Guard for Lifeline {
-    fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()> {
-        self.ask(&Message::Line { name, shutdown_value, sleeping }, Some(line))
+    fn output(
+        &mut self,
+        name: &str,
+        line: RawFd,
+        shutdown_value: ShutdownValue<bool>,
+        sleeping: Option<&str>,
+    ) -> io::Result<()> {
+        self.ask(&Message::Line { name, shutdown_value: shutdown_value.get(), sleeping }, Some(line))
     }
 
     fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()> {

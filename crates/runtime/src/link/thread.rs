@@ -320,7 +320,7 @@ impl LinkThread {
         if read.is_forced {
             self.handshake.stop();
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
-            self.request(Request::Shutdown(stop.remedy("then FIRMWARE_RESTART")));
+            self.request(Request::Shutdown(stop.remedy("send FIRMWARE_RESTART")));
         }
         Ok(read.is_over)
     }

@@ -32,8 +32,8 @@ pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Judgment {
     let came = record.stop.block.and_then(|block| record.arrived(block));
     // A time that is not the block's own proves only that the block came in time.
     let Some(Arrival { at: came, .. }) = came.filter(|came| came.is_exact || in_time(came.at)) else {
-        let what = format!("an event was asked for {} after its time", span_text(-due));
-        let unknown = Judgment::new(Culprit::Unknown, format!("{what}; not known when its block came"), "");
+        let what = format!("the host asked for an event {} after its time", span_text(-due));
+        let unknown = Judgment::new(Culprit::Unknown, format!("{what}; it is unknown when its block came"), "");
         return of_core(record, (due, 0)).unwrap_or(unknown);
     };
     let late = came - due;
@@ -43,7 +43,7 @@ pub(super) fn too_close(record: &Record, due: i64, trouble: &str) -> Judgment {
         let from = if in_time(came) { came } else { full.unwrap_or(came) };
         return of_bus(record, (from, 0)).or_else(|| of_core(record, (from, 0))).unwrap_or_else(|| {
             let what = format!(
-                "not known who was late: the host's block came {} before its event, and the core ran it {} after the event",
+                "it is unknown who was late: the host's block came {} before its event, and the core ran it {} after the event",
                 span_text(-late),
                 span_text(-due)
             );
@@ -114,7 +114,7 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Judgmen
         };
     }
     let Some(before) = record.last_block() else {
-        return Judgment::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
+        return Judgment::new(Culprit::Unknown, format!("it is unknown when the host sent something: {trouble}"), "");
     };
     // The host waits for an acknowledgement.
     if -before > SILENT

@@ -116,7 +116,7 @@ fn stopped(record: &Record, text: &str, trouble: &str) -> Judgment {
         return match text {
             _ if text == reason::TIMER_PAST.text() => stood_still(record, trouble),
             _ if text == reason::TIMER_TOO_CLOSE.text() || text.starts_with(MISSED) => {
-                Judgment::new(Culprit::Unknown, format!("not known who was late: {trouble}"), "")
+                Judgment::new(Culprit::Unknown, format!("it is unknown who was late: {trouble}"), "")
             }
             _ => other_reason(record, trouble),
         };
@@ -155,7 +155,7 @@ fn asked(record: &Record) -> Judgment {
         return Judgment::new(Culprit::Nobody, format!("nobody was late{}", on_time(record)), "");
     }
     let mut finding = of_core(record, (at - late, at)).unwrap_or_else(|| {
-        Judgment::new(Culprit::Unknown, format!("not known why a timer was {} late", span_text(late)), "")
+        Judgment::new(Culprit::Unknown, format!("it is unknown why a timer was {} late", span_text(late)), "")
     });
     finding.what += &format!(" ({} before the end of the recording)", span_text((-at).max(0)));
     finding

@@ -27,7 +27,7 @@ pub(super) fn late_step(record: &Record, due: i64, trouble: &str) -> Judgment {
             let what = format!("steps were closer together than their pulses{}: {trouble}", on_time(record));
             return Judgment::new(Culprit::Work, what, "");
         }
-        _ => format!("not known why an event was {} late: {trouble}", span_text(-due)),
+        _ => format!("it is unknown why an event was {} late: {trouble}", span_text(-due)),
     };
     with_power(record, span, Judgment::new(Culprit::Unknown, what, ""))
 }
@@ -94,7 +94,7 @@ pub(super) fn of_core(record: &Record, span: Span) -> Option<Judgment> {
     }
     lost.filter(|lost| *lost >= half.max(LOST)).map(|_| {
         let what = format!(
-            "not known why the core did nothing for {}: it did not wait for a processor, so that a call blocked it, or everything stood still",
+            "it is unknown why the core did nothing for {}: it did not wait for a processor, so a call blocked it, or everything stood still",
             span_text(gap_long)
         );
         with_power(record, span, Judgment::new(Culprit::Unknown, what, ""))

@@ -15,7 +15,7 @@ mod boards;
 mod buses;
 mod examples;
 
-use pinion_firmware::board::{Bias, ChipSelect, Line};
+use pinion_firmware::board::{Bias, ChipSelect, Line, ShutdownValue};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, VirtualClock};
 
 /// A board in virtual time.
@@ -44,7 +44,7 @@ impl Bench {
 
     fn output(&mut self, name: &str, value: bool) -> Arc<dyn Line> {
         let pin = self.pin(name);
-        self.board.line(pin, Direction::Output { level: value, shutdown_value: value }).unwrap().line
+        self.board.line(pin, Direction::at_rest(value)).unwrap().line
     }
 
     fn input(&mut self, name: &str) -> Arc<dyn Line> {
@@ -296,7 +296,7 @@ fn a_wrong_pin_says_which_and_what_to_do() {
     let (step, endstop) = (pin("x_step", board), pin("x_endstop", board));
     let sensor = pin("bed_sensor", board);
     let nowhere = Pin(u32::MAX);
-    let output = Direction::Output { level: false, shutdown_value: false };
+    let output = Direction::at_rest(false);
     let input = Direction::Input(Bias::None);
     let errors = [
         (board.line(nowhere, output).err(), reason::NOT_OUTPUT, "no pin 4294967295"),
@@ -463,14 +463,14 @@ fn use_all(config: SimConfig) {
     let mut lines: Vec<Arc<dyn Line>> = Vec::new();
     for number in 0..bench.board.pins.len() {
         let pin = Pin(number as u32);
-        let output = Direction::Output { level: true, shutdown_value: true };
+        let output = Direction::at_rest(true);
         lines.extend(bench.board.line(pin, output).map(|claimed| claimed.line));
         lines.extend(bench.board.line(pin, Direction::Input(Bias::None)).map(|claimed| claimed.line));
         if let Ok(OnWorker { mut device, .. }) = bench.board.adc(pin) {
             device.read().unwrap();
         }
         let cycle = Ticks::from_ms(1);
-        let _ = bench.board.pwm(PwmConfig { pin, cycle, value: 12_345, shutdown_value: 0 });
+        let _ = bench.board.pwm(PwmConfig { pin, cycle, value: 12_345, shutdown_value: ShutdownValue::default() });
     }
     let mut noise = Noise::of("bytes", 1);
     for seconds in [0.0, 1e-6, 0.002, 0.3, 1e5] {

@@ -5,7 +5,7 @@ use std::collections::HashSet;
 
 pub(crate) use pinion_firmware::trouble::Trouble;
 
-use super::pin::is_word;
+use super::pin::is_klippy_name;
 
 /// The allowed range of a number.
 pub(crate) enum Bound {
@@ -18,7 +18,7 @@ pub(crate) enum Bound {
 pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), Trouble> {
     let mut seen = HashSet::new();
     names.try_for_each(|name| {
-        if !is_word(name) {
+        if !is_klippy_name(name) {
             no_name(kind, name)
         } else if !seen.insert(name) {
             wrong(kind, "name", &format!("two have the name `{name}`"), "rename one")

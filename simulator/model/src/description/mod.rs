@@ -6,6 +6,7 @@ pub(crate) mod boards;
 pub(crate) mod buses;
 pub(crate) mod check;
 #[cfg(test)]
+#[path = "../../tests/support/default.rs"]
 pub(crate) mod default;
 pub(crate) mod heater;
 pub(crate) mod kinematics;

@@ -55,10 +55,10 @@ pub(crate) fn on_board(name: &str) -> (Option<&str>, &str) {
 /// Whether `text` is the name of a pin or a bus, perhaps with its board.
 pub(crate) fn is_local(text: &str) -> bool {
     let (board, local) = on_board(text);
-    board.is_none_or(is_word) && is_word(local)
+    board.is_none_or(is_klippy_name) && is_klippy_name(local)
 }
 
 /// Whether klippy accepts `text` as the name of a pin or of a section.
-pub(crate) fn is_word(text: &str) -> bool {
+pub fn is_klippy_name(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c))
 }

@@ -218,19 +218,6 @@ impl Bed {
         Bed { shape, ends_mm, head }
     }
 
-    /// The bed under a cartesian printer with one motor for each axis.
-    #[cfg(test)]
-    pub fn under(
-        shape: BedConfig,
-        x: Option<Arc<super::motion::Axis>>,
-        y: Option<Arc<super::motion::Axis>>,
-        z: Option<Arc<super::motion::Axis>>,
-    ) -> Bed {
-        let [x, y, z] = [x, y, z].map(|axis| axis.map(|axis| axis.rail().clone()));
-        let z = Plane::new(z.into_iter().map(|z| (z, [0.0; 2])).collect());
-        Bed::new(shape, Head::Cartesian { x, y, z })
-    }
-
     /// The height of the bed at a place: two slopes and a bow, each 0 in the middle.
     pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
         // From -1 at one end of the bed to 1 at the other.

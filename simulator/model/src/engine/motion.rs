@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the pins of a stepper driver move.
+//! Axes: the pins of a stepper driver, its motor, and the rails that the motor moves.
 //!
 //! The core of a board drives the pins of its motors. Any thread may read. Nothing here locks, blocks or allocates.
 
@@ -54,16 +54,6 @@ pub struct Stride {
 }
 
 impl Axis {
-    /// A motor with a rail of its own.
-    #[cfg(test)]
-    pub fn new(config: &AxisConfig) -> Axis {
-        let motor = Motor::at(config.start_mm, config);
-        let step_mm = 1.0 / config.steps_per_mm;
-        let rail =
-            Arc::new(Rail::new(&crate::description::rails::RailConfig::of(config), vec![(motor.clone(), step_mm)]));
-        Axis::driving(config, motor, rail.clone(), vec![(rail, step_mm)])
-    }
-
     /// A motor that moves these rails, each by this way in a step.
     pub fn driving(config: &AxisConfig, motor: Arc<Motor>, rail: Arc<Rail>, moves: Vec<(Arc<Rail>, f64)>) -> Axis {
         Axis {

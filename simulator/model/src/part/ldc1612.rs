@@ -224,7 +224,7 @@ struct Ldc1612 {
     registers: RegisterMap<u16>,
     /// DATA0_LSB belongs to the last DATA0_MSB that was read.
     lsb: u16,
-    /// The register of which a message has the first byte.
+    /// The register whose first byte a message has.
     word: u16,
 }
 

@@ -116,7 +116,7 @@ struct Reader {
     base: [f64; 4],
     relative: bool,
     relative_filament: bool,
-    /// Whether the next place begins anew.
+    /// Whether the next place begins another path.
     is_start: bool,
     layer: u32,
     layer_z: f64,

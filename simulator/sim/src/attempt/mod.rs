@@ -29,10 +29,10 @@ use steps::STEPS;
 use trial::Trial;
 pub(crate) use watching::{Host, Watching};
 
-/// What klippy does on the printer.
+/// The work of klippy on the printer.
 #[derive(Clone, Debug)]
 pub(crate) enum Task {
-    /// What every owner does after a change (`--try`).
+    /// The steps of every owner after a change (`--try`).
     Try,
     /// It prints a file (`--print`).
     Print(PrintOptions),
@@ -106,7 +106,10 @@ pub(crate) fn run(
         trial.host.watch.progress.begin(step.name, now);
         let outcome = match &trial.broken {
             Some(why) => Outcome::Skipped(format!("not tried: {why}")),
-            None => trial.tried(step),
+            None => {
+                let outcome = (step.run)(&mut trial).map_or_else(|outcome| outcome, Outcome::Passed);
+                trial.judged(outcome)
+            }
         };
         if ended.load(Ordering::SeqCst) {
             break;

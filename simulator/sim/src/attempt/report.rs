@@ -76,7 +76,7 @@ pub(super) struct Progress {
     /// When it began, by the printer's clock and by the computer's.
     began: (Duration, Instant),
     shown: Option<Instant>,
-    /// What follows the times.
+    /// The text after the times.
     more: String,
 }
 
@@ -102,7 +102,7 @@ impl Progress {
         self.show(now);
     }
 
-    /// What follows the times from now on.
+    /// Sets the text after the times.
     pub(super) fn say(&mut self, more: String) {
         self.more = more;
     }

@@ -16,7 +16,7 @@ use pinion_printer_config::Trouble;
 /// The user and the group "nobody" of Debian.
 const NOBODY: u32 = 65_534;
 
-/// Starts this program anew as an ordinary user, if root runs it: as the one who called sudo, or as the owner of the
+/// Starts this program again as an ordinary user, if root runs it: as the one who called sudo, or as the owner of the
 /// printer.cfg, or as nobody. `folder` becomes that user's, if it is new or empty. With `realtime` the program keeps the
 /// right to real time.
 ///

@@ -11,7 +11,6 @@ use serde_json::Value;
 
 use super::place::place_of;
 use super::report::Outcome;
-use super::steps::{Step, is_first};
 use super::{Attempt, Host, unwritten};
 use crate::camera::picture;
 use crate::own::serve::{Folder, Own};
@@ -35,7 +34,8 @@ const BUSY: [&str; 7] = [
     "Communication timeout during homing",
     "Timeout on wait for",
 ];
-/// What is tried, and how far it came.
+
+/// A printer under trial, and how far the trial came.
 pub(super) struct Trial<'a> {
     pub(super) attempt: &'a Attempt,
     folder: &'a Folder,
@@ -124,9 +124,8 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Runs a step.
-    pub(super) fn tried(&mut self, step: &Step) -> Outcome {
-        let outcome = (step.run)(self).map_or_else(|outcome| outcome, Outcome::Passed);
+    /// Adds to a failure that this computer may have caused it.
+    pub(super) fn judged(&self, outcome: Outcome) -> Outcome {
         match outcome {
             Outcome::Failed { cause, place }
                 if self.attempt.real_time && BUSY.iter().any(|words| cause.contains(words)) =>
@@ -243,13 +242,18 @@ impl<'a> Trial<'a> {
         self.config().section("printer")?.text("kinematics")
     }
 
-    /// What klippy says about its toolhead.
+    /// klippy's status of its toolhead.
     pub(super) fn toolhead(&mut self) -> Result<Value, Outcome> {
         match self.host.query(&["toolhead"]) {
             Ok(mut status) => Ok(status["toolhead"].take()),
             Err(_) => Err(self.failed("klippy does not answer", None)),
         }
     }
+}
+
+/// Whether a step comes before anything is homed.
+fn is_first(step: &str) -> bool {
+    ["ready", "homed"].contains(&step)
 }
 
 /// Whether an axis homes by its driver's StallGuard, or shares its belts with one that does. It loses steps then.

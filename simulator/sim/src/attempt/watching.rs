@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What is looked at while klippy runs: the nozzle's path, the speed of the motors, and the line of progress.
+//! Watches a printer while klippy runs: the nozzle's path, the speed of the motors, and the line of progress.
 
 use std::time::Duration;
 

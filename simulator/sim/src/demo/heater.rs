@@ -111,7 +111,7 @@ impl<'a> Heater<'a> {
                 return Err(Error::Plan {
                     subject: self.pin.name.clone(),
                     why: format!(
-                        "{celsius:.1} °C after {} s instead of {target_c:.1} °C; check heater and sensor, or give it more time",
+                        "{celsius:.1} °C after {} s instead of {target_c:.1} °C; check heater and sensor",
                         TIMEOUT.as_secs()
                     ),
                 });

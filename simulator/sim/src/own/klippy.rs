@@ -100,7 +100,7 @@ impl Klippy {
         );
     }
 
-    /// What klippy says.
+    /// klippy's verdict.
     fn output(&self, own: &Own) -> io::Result<String> {
         let folder = Folder::make(own, None, None).map_err(|trouble| io::Error::other(trouble.to_string()))?;
         let output = self.run(own, &folder);

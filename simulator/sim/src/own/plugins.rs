@@ -24,7 +24,7 @@ const OF_INTERFACE: &str = "[virtual_sdcard]\npath: ~/printer_data/gcodes\non_er
 /// Longest source of klippy.
 const SOURCE_MAX: u64 = 4 << 20;
 
-/// What a copy is without.
+/// The sections and options that a copy is without.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LeftOut {
     /// The whole names of the sections.
@@ -52,7 +52,7 @@ impl StandIn {
 }
 
 impl LeftOut {
-    /// What klippy's copy of a configuration has to be without. `klipper` is the checkout, if it is known.
+    /// The sections and options that klippy's copy has to be without. `klipper` is the checkout, if it is known.
     ///
     /// # Errors
     ///
@@ -154,7 +154,7 @@ fn hangs_on(config: &Config, section: &Section, left_out: &[String]) -> bool {
     measures() || asks() || !is_printers && section.kind() != "heater_bed" && has_pin()
 }
 
-/// What klippy needs of an included file that is not there.
+/// The sections that klippy needs from an included file that is missing.
 pub(super) fn stand_in(path: &Path) -> &'static str {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     if ["mainsail.cfg", "fluidd.cfg", "client.cfg"].contains(&name) { OF_INTERFACE } else { "" }

@@ -42,7 +42,7 @@ pub(crate) struct Own {
     pub(crate) notes: Vec<Trouble>,
     /// The steppers whose endstops have the phases that are saved for them.
     in_phase: BTreeSet<String>,
-    /// What klippy's copy is without.
+    /// The sections and options that klippy's copy is without.
     pub(super) left_out: LeftOut,
 }
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What all parts of the translation of a printer.cfg share: pins, each of which one section takes, buses, and notes.
+//! The shared state of a translation of a printer.cfg: pins (only one section can take each), buses, and notes.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use pinion_model::MCUS_MAX;
+use pinion_model::{MCUS_MAX, is_klippy_name};
 use pinion_printer_config::pins::{Aliases, MAIN, Pin, section_of};
 use pinion_printer_config::{Config, Section, Trouble};
 
@@ -246,16 +246,8 @@ impl Translator<'_> {
         for (chip, pin) in self.taken.keys() {
             all.entry(chip.clone()).or_default().insert(pin.clone());
         }
-        for section in self.config.sections().iter().filter(|section| !has_no_pins(section.kind())) {
-            for setting in section.settings().iter().filter(|setting| is_pin(&setting.key)) {
-                for text in setting.value.split([',', '\n']).map(str::trim).filter(|text| !text.is_empty()) {
-                    // Others have an alias before a `=`, or no pin at all: klippy decides.
-                    let Ok(pin) = self.pin_of(section, &setting.key, text) else { continue };
-                    if self.is_real(&pin) && is_name(&pin.name) {
-                        all.entry(pin.chip).or_default().insert(pin.name);
-                    }
-                }
-            }
+        for pin in self.named_pins() {
+            all.entry(pin.chip).or_default().insert(pin.name);
         }
         for (number, mcu) in self.mcus.iter().enumerate() {
             let names: Vec<String> = all.get(mcu).into_iter().flatten().cloned().collect();
@@ -271,15 +263,20 @@ impl Translator<'_> {
 
     /// The chip of an MCU, as far as its pins show it.
     pub(super) fn chip(&self, mcu: &str) -> &'static str {
-        let mut names = Vec::new();
-        for section in self.config.sections().iter().filter(|section| !has_no_pins(section.kind())) {
-            for setting in section.settings().iter().filter(|setting| is_pin(&setting.key)) {
-                let texts = setting.value.split([',', '\n']).filter(|text| !text.trim().is_empty());
-                let pins = texts.filter_map(|text| self.pin_of(section, &setting.key, text).ok());
-                names.extend(pins.filter(|pin| pin.chip == mcu).map(|pin| pin.name));
-            }
-        }
-        chip_of(mcu, &names)
+        let pins = self.named_pins().filter(|pin| pin.chip == mcu);
+        chip_of(mcu, &pins.map(|pin| pin.name).collect::<Vec<String>>())
+    }
+
+    /// The pins of MCUs in all options. Other texts there have an alias before a `=`, or no pin at all: klippy decides.
+    fn named_pins(&self) -> impl Iterator<Item = Pin> {
+        let sections = self.config.sections().iter().filter(|section| !has_no_pins(section.kind()));
+        let settings = sections.flat_map(|section| section.settings().iter().map(move |setting| (section, setting)));
+        let texts = settings.filter(|(_, setting)| is_pin(&setting.key)).flat_map(|(section, setting)| {
+            let texts = setting.value.split([',', '\n']).map(str::trim).filter(|text| !text.is_empty());
+            texts.map(move |text| (section, setting, text))
+        });
+        let pins = texts.filter_map(|(section, setting, text)| self.pin_of(section, &setting.key, text).ok());
+        pins.filter(|pin| self.is_real(pin) && is_klippy_name(&pin.name))
     }
 }
 
@@ -292,11 +289,6 @@ fn has_no_pins(kind: &str) -> bool {
 /// Whether an option has a pin, or several.
 fn is_pin(key: &str) -> bool {
     key == "pin" || key == "pins" || key.ends_with("_pin") || key.ends_with("_pins")
-}
-
-/// Whether a pin may have this name.
-fn is_name(name: &str) -> bool {
-    !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c))
 }
 
 /// The chip that has pins with these names. Chips whose own thermometers klippy reads without their memory come first.

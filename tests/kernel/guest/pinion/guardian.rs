@@ -58,6 +58,45 @@ fn killed_crashed_or_aborted_the_outputs_are_safe_and_free() {
     // Each program after the first one had to claim the lines of the program before.
 }
 
+/// Beside heaters, fans and hardware PWM ([`Outputs`]): what else drives a line.
+#[test]
+fn a_killed_program_s_other_lines_go_to_their_shutdown_values() {
+    let sim = GpioSim::new("lab", 8);
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    let output = |oid, pin, default| {
+        format!("config_digital_out oid={oid} pin=lab/gpio{pin} value={default} default_value={default} max_duration=0")
+    };
+    configure(
+        client,
+        7,
+        &[
+            // It stays on.
+            "set_digital_out pin=lab/gpio0 value=1".to_owned(),
+            // The enable pin of a motor: high is off.
+            output(0, 1, 1),
+            "config_stepper oid=1 step_pin=lab/gpio2 dir_pin=lab/gpio3 invert_step=1 step_pulse_ticks=100".to_owned(),
+            "config_spi oid=2 pin=lab/gpio4 cs_active_high=0".to_owned(),
+            // An input becomes an output, and an output becomes an input.
+            "config_endstop oid=3 pin=lab/gpio5 pull_up=0".to_owned(),
+            output(4, 5, 0),
+            output(5, 6, 1),
+            "config_endstop oid=6 pin=lab/gpio6 pull_up=0".to_owned(),
+        ],
+    );
+    run(client, "update_digital_out oid=0 value=0");
+    run(client, "update_digital_out oid=4 value=1");
+    assert_eq!([0, 1, 2, 4, 5].map(|offset| sim.level(offset)), [true, false, true, true, true]);
+    let guardian = program.guardian();
+    let trace = Trace::start();
+    program.kill();
+    sysfs::wait_until("the guardian is gone", || !exists(guardian));
+    let last = |offset| trace.writes_to(sim.kernel_number(offset)).pop().map(|write| write.level);
+    let expected = [Some(true), Some(true), Some(true), Some(false), Some(true), Some(false), None];
+    assert_eq!([0, 1, 2, 3, 4, 5, 6].map(last), expected);
+    program.wait_for_line(&["guardian: ", "all 6 outputs are driven to their shutdown values"]);
+}
+
 #[test]
 fn a_core_that_hangs_is_noticed() {
     let outputs = Outputs::new();

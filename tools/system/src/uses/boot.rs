@@ -9,7 +9,7 @@ use super::super::board::{Board, Boot, is_pi, is_pi5, model, pi_config};
 use super::lines::Names;
 use super::{Resource, Source, Use, Uses};
 
-/// What each overlay takes.
+/// The resources of each overlay.
 const OVERLAYS: &str = include_str!("overlays.txt");
 /// Highest number of files that a config.txt includes. Raspberry Pi's firmware reads ten levels.
 const INCLUDES_MAX: usize = 10;
@@ -38,7 +38,7 @@ pub struct Loaded {
     pub place: String,
     /// Whether it applies to this computer for sure.
     pub is_sure: bool,
-    /// What it takes, from the table. `None` if it is not known.
+    /// Its resources, from the table. `None` if it is not known.
     takes: Option<&'static str>,
 }
 
@@ -237,7 +237,7 @@ fn loaded(lines: &[Line], is_pi5: bool) -> Vec<Loaded> {
     all
 }
 
-/// What an overlay takes, from the table. `None` if it is not known.
+/// The resources of an overlay, from the table. `None` if it is not known.
 fn entry(name: &str, is_pi5: bool) -> Option<&'static str> {
     let of = |name: &str| {
         let mut entries = OVERLAYS.lines().filter(|line| !line.starts_with('#') && !line.is_empty());

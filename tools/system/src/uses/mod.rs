@@ -82,7 +82,7 @@ impl std::fmt::Display for Resource {
     }
 }
 
-/// What says that something is used.
+/// The evidence that something is used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// The kernel: a driver, or a consumer of a line.
@@ -104,7 +104,7 @@ pub struct Use {
     pub user: String,
     /// The file and line, or the kernel's folder.
     pub place: String,
-    /// What says so.
+    /// The evidence.
     pub source: Source,
     /// The bus to which a line is switched. Another user of this bus is no conflict.
     pub function: Option<String>,

@@ -240,12 +240,23 @@ mod tests {
     use std::thread;
     use std::time::{Duration, Instant};
 
-    /// A clock that is this many times slower than the computer's. So other programs disturb the workers less.
-    struct Slow(Instant, u32);
+    /// A clock that is slower than the computer's. So other programs disturb the workers less.
+    struct Slow {
+        began: Instant,
+        factor: u32,
+        /// Longest step between two reads. While none of the workers runs, no time passes.
+        step_max: Duration,
+        /// The computer's time at the last read, and this clock's.
+        last: Mutex<(Duration, Duration)>,
+    }
 
     impl TimeSource for Slow {
         fn now(&self) -> Clock {
-            Clock::EPOCH + Ticks((self.0.elapsed() / self.1).as_nanos() as u32 / NS_PER_TICK as u32)
+            let (before, now) = &mut *self.last.lock().unwrap();
+            let elapsed = self.began.elapsed() / self.factor;
+            *now += elapsed.saturating_sub(*before).min(self.step_max);
+            *before = elapsed.max(*before);
+            Clock::EPOCH + Ticks(now.as_nanos() as u32 / NS_PER_TICK as u32)
         }
 
         fn instant_of(&self, _: Duration) -> Clock {
@@ -315,7 +326,9 @@ mod tests {
     fn workers(interrupted: Option<u32>, slower: u32) -> (Shift, Watcher, Arc<Chip>) {
         let chip = Arc::new(Chip { interrupted, ..Chip::default() });
         let line = |is_clock| Arc::new(Wire { chip: chip.clone(), is_clock });
-        let time: Arc<dyn TimeSource> = Arc::new(Slow(Instant::now(), slower));
+        let step_max = if slower > 100 { Duration::from_micros(1) } else { Duration::MAX };
+        let time: Arc<dyn TimeSource> =
+            Arc::new(Slow { began: Instant::now(), factor: slower, step_max, last: Mutex::default() });
         let watcher = Watcher { sclk: line(true), time: time.clone(), watch: Arc::default() };
         let shift = Shift {
             sclk: line(true),

@@ -52,7 +52,7 @@ impl Wire {
     /// Drives the line high, its level between messages.
     pub(super) fn idle(&self) -> Result<(), Shutdown> {
         match self.single {
-            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_value: true }),
+            Some(_) => self.tx.turn(Direction::at_rest(true)),
             None => self.tx.write(true),
         }
     }

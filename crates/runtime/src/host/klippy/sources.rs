@@ -17,6 +17,10 @@ use std::time::SystemTime;
 
 use pinion_linux::foreign;
 
+#[cfg(fuzzing)]
+#[path = "../../../tests/support/sources_fuzz.rs"]
+pub mod fuzz;
+
 /// Highest numbers that are read of a checkout: names in its folders, files, bytes of one file and of all files,
 /// messages. klippy's own come first. Further ones, of a plugin that brings much along, are left out.
 const NAMES_MAX: usize = 20_000;
@@ -277,17 +281,6 @@ fn literal(source: &[u8], at: usize, string: &mut Vec<u8>) -> usize {
     };
     string.extend_from_slice(&source[begin..text_end]);
     end
-}
-
-/// For `fuzz/`: any bytes as a source. Each shape is one that its own text makes.
-#[cfg(fuzzing)]
-pub fn fuzz(bytes: &[u8]) {
-    strings(bytes, |string| {
-        if let Some(shape) = Shape::of(string) {
-            let format: Vec<String> = shape.0.split(' ').skip(1).map(|name| format!("{name}=%u")).collect();
-            assert_eq!(Shape::of(&format!("{} {}", shape.name(), format.join(" "))), Some(shape));
-        }
-    });
 }
 
 #[cfg(test)]

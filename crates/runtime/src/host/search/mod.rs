@@ -37,7 +37,7 @@ use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
 pub(crate) use looker::NAME;
 #[cfg(fuzzing)]
-pub use message::search;
+pub(crate) use message::fuzz;
 
 /// How long the new process may take to be ready, in seconds.
 const START_S: i64 = 5;

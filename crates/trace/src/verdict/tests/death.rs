@@ -65,7 +65,7 @@ fn a_program_that_works_is_reported_with_its_latest_timer() {
     asked(
         late.silent(&["sampler"], 0..LATEST),
         Culprit::Unknown,
-        "not known why a timer was 12.0 ms late (5.0 s before the end of the recording)",
+        "it is unknown why a timer was 12.0 ms late (5.0 s before the end of the recording)",
     );
     asked(Scene::default(), Culprit::Unknown, "no timer is in the recording: nobody can have been late");
 }

@@ -31,7 +31,7 @@ const MISSED_PWM: &str = "Missed scheduling of next hard pwm event";
 const TROUBLE: &str = "stepper oid 3: some trouble: do something";
 const HOST_LATE: &str = "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load";
 const WOKEN_LATE: &str = "the kernel woke the core 12.0 ms late, though it did not wait for a processor: use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor";
-const BLOCK_UNKNOWN: &str = "an event was asked for 12.0 ms after its time; not known when its block came";
+const BLOCK_UNKNOWN: &str = "the host asked for an event 12.0 ms after its time; it is unknown when its block came";
 
 fn ms(ms: u32) -> Ticks {
     Ticks::from_ms(ms)
@@ -171,23 +171,23 @@ fn a_verdict_needs_evidence() {
     later(STOP - 30_000).judged(
         TOO_CLOSE,
         Culprit::Unknown,
-        "not known who was late: the host's block came 18.0 ms before its event, and the core ran it 12.0 ms after the event",
+        "it is unknown who was late: the host's block came 18.0 ms before its event, and the core ran it 12.0 ms after the event",
     );
     for reason in ["Stepper too far in past", "Rescheduled timer in the past"] {
         bare(STOP - 12_000).judged(
             reason,
             Culprit::Unknown,
-            &format!("not known why an event was 12.0 ms late: {TROUBLE}"),
+            &format!("it is unknown why an event was 12.0 ms late: {TROUBLE}"),
         );
     }
     bare(STOP - 100).judged(
         MISSED_PWM,
         Culprit::Unknown,
-        &format!("not known when the host sent something: {TROUBLE}"),
+        &format!("it is unknown when the host sent something: {TROUBLE}"),
     );
     // The events of the rings' beginnings are lost, and with them the time.
     for reason in [TOO_CLOSE, MISSED_PWM] {
-        Scene::calm().judged(reason, Culprit::Unknown, &format!("not known who was late: {TROUBLE}"));
+        Scene::calm().judged(reason, Culprit::Unknown, &format!("it is unknown who was late: {TROUBLE}"));
     }
 }
 

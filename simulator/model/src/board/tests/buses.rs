@@ -101,7 +101,7 @@ fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
     mosi.line.device.exchange(&mut message).unwrap();
     let strip = bench.probe.sights().find(|(name, _)| *name == "strip").unwrap();
     assert_eq!(strip.1.to_string(), "#00ff00 off off off off off off off");
-    let error = bench.board.line(pin, Direction::Output { level: false, shutdown_value: false }).err().unwrap();
+    let error = bench.board.line(pin, Direction::at_rest(false)).err().unwrap();
     assert!(error.trouble.cause.contains("spidev3.0 of the simulated printer is an SPI bus's data output"), "{error}");
     let led = bench.pin("led");
     assert!(bench.board.mosi(led, 3_200_000).unwrap().is_none());

@@ -111,7 +111,7 @@ pub(super) struct Room {
     pub(super) replaces: bool,
 }
 
-/// What the chip feels.
+/// The acceleration at the chip.
 pub(super) struct Head {
     clock: Arc<dyn TimeSource>,
     rings: [Option<Ring>; 3],

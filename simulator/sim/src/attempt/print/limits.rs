@@ -155,6 +155,9 @@ mod tests {
         assert_eq!(limits.json(&[&motor(5000.0), &motor(10_000.0)])["edges_share"], 0.06);
         assert!(said(&limits, &[&motor(5000.0)]).ends_with("take at most 2.0 % of a processor\n"));
         let other = file(&folder, "other.json", json!({ "computer": "another board" }));
+        let refused = Limits::read(std::slice::from_ref(&other)).unwrap_err();
+        assert!(refused.contains("it has no figures: name an output of \"pinion latency --json\""), "{refused}");
+        fs::write(&other, fs::read_to_string(&late).unwrap().replace("a board", "another board")).unwrap();
         assert!(Limits::read(&[late, other]).unwrap_err().contains("measure both on one computer"));
         let wrong = folder.path().join("wrong.json");
         fs::write(&wrong, "{}").unwrap();

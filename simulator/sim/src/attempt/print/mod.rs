@@ -168,7 +168,7 @@ struct Print<'a> {
     line: usize,
     /// Filament was laid.
     has_begun: bool,
-    /// What klippy says about commands that it does not know. It goes on then.
+    /// klippy's words about commands that it does not know. It goes on then.
     unknown: Vec<String>,
     config: &'a Config,
     limits: Option<Limits>,
@@ -186,7 +186,7 @@ impl Print<'_> {
             Ok(()) => self.follow(began).err(),
             Err(words) => Some(words),
         };
-        // What klippy has planned is still on its way.
+        // Moves that klippy has planned are still on their way.
         let stopped = stopped.or_else(|| self.finish().err());
         let total_s = self.host.now().saturating_sub(began).as_secs_f64();
         // The report does not depend on it.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a printer does during a print: it heats, homes, levels, prints or is paused.
+//! The phases of a print: the printer heats, homes, levels, prints or is paused.
 
 /// A part of a print.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,7 +25,7 @@ impl Phase {
     }
 }
 
-/// What is known about an instant.
+/// The printer at an instant.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sight<'a> {
     /// The line of the file that klippy runs.

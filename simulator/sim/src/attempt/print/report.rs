@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a print was like.
+//! The report of a print.
 
 use std::path::Path;
 use std::time::Duration;
@@ -69,7 +69,7 @@ pub(super) struct Printed {
     pub(super) compared: Result<Comparison, String>,
     /// Axes that lost steps.
     pub(super) lost: Vec<(String, u64)>,
-    /// What klippy said about commands that it does not know.
+    /// klippy's words about commands that it does not know.
     pub(super) unknown: Vec<String>,
     pub(super) pauses: usize,
     pub(super) stopped: Option<Stopped>,

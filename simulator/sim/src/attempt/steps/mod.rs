@@ -17,7 +17,7 @@ mod square;
 use super::report::Outcome;
 use super::trial::Trial;
 
-/// What a step saw of a printer that works. The error is any other outcome.
+/// The observation of a step on a printer that works. The error is any other outcome.
 type Seen = Result<String, Outcome>;
 
 /// Something that is tried.
@@ -42,11 +42,6 @@ pub(super) const STEPS: &[Step] = &[
     Step { name: "printed", run: print::printed },
     Step { name: "cooled", run: heaters::cooled },
 ];
-
-/// Whether a step comes before anything is homed.
-pub(super) fn is_first(step: &str) -> bool {
-    ["ready", "homed"].contains(&step)
-}
 
 fn skipped<T>(why: impl Into<String>) -> Result<T, Outcome> {
     Err(Outcome::Skipped(why.into()))

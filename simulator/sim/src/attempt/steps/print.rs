@@ -39,7 +39,7 @@ pub(super) fn printed(trial: &mut Trial<'_>) -> Seen {
     let asked = AskedPath::read(BufReader::new(text.as_bytes()), &name);
     let asked = asked.map_err(|trouble| trial.failed(trouble.to_string(), None))?;
     prepare(trial)?;
-    // What was sent before is not the print's path.
+    // Moves that were sent before are not in the print's path.
     trial.gcode("M400", LONG)?;
     let said = said_mm(trial)?;
     let before = trial.lost();

@@ -117,6 +117,8 @@ pub struct State {
     pub(super) transfers: Vec<(u64, u32, u8, u32, Message, bool)>,
     /// Every value of a PWM channel: pin, time, value.
     pub pwm_values: Vec<(u32, u64, u16)>,
+    /// The value of each PWM channel if the program dies.
+    pub pwm_shutdown_values: HashMap<u32, u16>,
     /// The period of each PWM channel.
     pub pwm_cycles: HashMap<u32, u32>,
     /// Whether pins 0 to 31 are in a bank ([`Bank`]). Set it before they are claimed.
@@ -306,10 +308,8 @@ impl Bench {
 
     /// The level of an output if the program dies.
     pub fn shutdown_value(&self, pin: u32) -> bool {
-        match self.state().directions[&pin] {
-            Direction::Output { shutdown_value, .. } => shutdown_value,
-            input => panic!("pin {pin} is {input:?}"),
-        }
+        let direction = self.state().directions[&pin];
+        direction.shutdown_value().unwrap_or_else(|| panic!("pin {pin} is {direction:?}")).get()
     }
 
     /// Puts a chip on SPI bus 0 or 1.

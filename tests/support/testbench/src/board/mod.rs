@@ -146,6 +146,7 @@ impl Board for FakeBoard {
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         let pin = self.0.claim(config.pin, PWM..PWM + PWMS, reason::PWM_CONFIG)?;
         let mut pwm = FakePwm { bench: self.0.clone(), pin };
+        self.0.state().pwm_shutdown_values.insert(pin, config.shutdown_value.get());
         pwm.set_cycle(config.cycle, config.value)?;
         Ok(OnWorker { bus: "pwm".into(), device: Box::new(pwm) })
     }
