@@ -30,5 +30,5 @@ pub(crate) fn linux(
     guard: Option<Box<dyn Guard>>,
     fast_gpio: FastGpio,
 ) -> (Box<dyn Board>, Timing) {
-    (Box::new(LinuxBoard::new(guard, fast_gpio)), Timing::of(clock))
+    (LinuxBoard::boxed(guard, fast_gpio), Timing::of(clock))
 }

@@ -144,7 +144,7 @@ fn names(processes: &[Process]) -> String {
 fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<(), String> {
     // This comes first, because another program may take over for it.
     let clock = Monotonic::start();
-    let (board, timing) = simulated(file, Arc::new(clock)).map_err(|error| error.to_string())?;
+    let (board, timing) = simulated(file, clock.shared()).map_err(|error| error.to_string())?;
     // The only host is this console, and it speaks every dialect.
     let helpers = Helpers::default();
     // The other signals end the MCU in order. Then `signal` says which one it was.
@@ -194,7 +194,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>, simulated: Open) -> Result<
             }
         }
     };
-    let ended = pinion_runtime::run(&options, board, timing, recording, helpers, ready);
+    let ended = pinion_runtime::run(&options, board, timing, recording, helpers, Some(Box::new(ready)));
     drop(terminal);
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();

@@ -22,9 +22,10 @@ use nix::unistd::getpid;
 
 use pinion_linux::gpio::Opener;
 use pinion_linux::uart::is_pseudo_terminal;
+pub use pinion_runtime::logging;
 use pinion_system::Computer;
 use pinion_system::klippy::klippys;
-use pinion_system::settings::{LogArgs, RunArgs};
+use pinion_system::settings::{LogArgs, RunArgs, run_args};
 
 mod add;
 mod attach;
@@ -35,7 +36,6 @@ pub mod dict;
 mod doctor;
 pub mod latency;
 mod link;
-pub mod logging;
 pub mod page;
 mod pins;
 mod report;
@@ -109,6 +109,19 @@ enum Command {
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
+    // A program that serves a host keeps its memory. So it does not make the options of the other subcommands.
+    if let Ok(Some(args)) = run_args(std::env::args_os()) {
+        logging::start(args.given.log_level.unwrap_or(LevelFilter::Info));
+        let status = run::run(&args, args.given.log_level, take_over);
+        logging::finish();
+        return status;
+    }
+    other_command()
+}
+
+/// Runs a subcommand that serves no host, or reports an error of the command line.
+#[inline(never)]
+fn other_command() -> ExitCode {
     let cli = Cli::parse();
     match cli.command {
         None | Some(Command::Run(_) | Command::Link(_) | Command::Attach(_)) => logging::start(cli.log.level()),
@@ -225,7 +238,7 @@ pub fn failed(error: impl std::fmt::Display) -> ExitCode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_system::settings::{OTHERS, run_args};
+    use pinion_system::settings::OTHERS;
     use std::os::unix::process::ExitStatusExt;
 
     #[test]

@@ -4,7 +4,6 @@
 use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use log::LevelFilter;
 use nix::unistd::{Pid, getpid, getppid};
@@ -67,7 +66,7 @@ pub fn run(args: &RunArgs, log_level: Option<LevelFilter>, simulated: Open) -> E
     // A simulated printer needs no guardian. It comes first, because another program may take over for it.
     let simulation = match &settings.board {
         BoardName::Linux => None,
-        BoardName::Sim(file) => match simulated(file.as_deref(), Arc::new(clock)) {
+        BoardName::Sim(file) => match simulated(file.as_deref(), clock.shared()) {
             Ok(opened) => Some(opened),
             Err(error) => return failed(error),
         },
@@ -98,8 +97,8 @@ pub fn run(args: &RunArgs, log_level: Option<LevelFilter>, simulated: Open) -> E
         );
     }
     let guard = helpers.guardian.as_ref().map(Guardian::guard);
-    let (board, timing) = simulation.unwrap_or_else(|| linux(Arc::new(clock), guard, settings.fast_gpio));
-    match pinion_runtime::run(&options(&settings), board, timing, recording, helpers, || ()) {
+    let (board, timing) = simulation.unwrap_or_else(|| linux(clock.shared(), guard, settings.fast_gpio));
+    match pinion_runtime::run(&options(&settings), board, timing, recording, helpers, None) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

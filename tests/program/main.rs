@@ -22,6 +22,7 @@ mod preinst;
 mod process;
 mod recorder;
 mod search;
+mod sections;
 mod show;
 mod slow;
 mod soak;

@@ -8,8 +8,8 @@ use crate::time::{CLOCK_FREQ, Ticks};
 /// Number of buckets in each octave (from a power of two to the next). So a bucket is at most as wide as an eighth of
 /// its values.
 const PARTS: usize = 8;
-/// Enough buckets for 2^32 ticks (86 s). Longer delays count as 2^32 ticks.
-const BUCKETS: usize = 30 * PARTS + PARTS;
+/// Enough buckets for 2^32 ticks (86 s), and as many as a byte has values. Longer delays count as 2^32 ticks.
+const BUCKETS: usize = 256;
 
 /// Counts samples by how late they were.
 #[derive(Clone, Debug)]
@@ -26,9 +26,10 @@ impl Default for Lateness {
 
 /// The bucket of a value in ticks. Values below 16 have a bucket each. Larger values share the eight buckets of their
 /// octave.
-fn bucket(late: u32) -> usize {
+fn bucket(late: u32) -> u8 {
     let octave = (late | PARTS as u32).ilog2() - PARTS.ilog2();
-    octave as usize * PARTS + (late >> octave) as usize
+    // The highest is 239.
+    (octave * PARTS as u32 + (late >> octave)) as u8
 }
 
 /// The largest value of a bucket.
@@ -44,11 +45,21 @@ fn upper(bucket: usize) -> u32 {
 impl Lateness {
     /// Records a sample.
     #[inline]
-    pub fn record(&mut self, Ticks(late): Ticks) {
-        self.counts[bucket(late)] += 1;
-        if late > self.max {
-            self.max = late;
-        }
+    pub fn record(&mut self, late: Ticks) {
+        self.count(late);
+        self.note_longest(late);
+    }
+
+    /// Records a sample that is not the longest one.
+    #[inline]
+    pub(crate) fn count(&mut self, Ticks(late): Ticks) {
+        self.counts[usize::from(bucket(late))] += 1;
+    }
+
+    /// A sample that was counted may be the longest one.
+    #[inline]
+    pub(crate) fn note_longest(&mut self, Ticks(late): Ticks) {
+        self.max = self.max.max(late);
     }
 
     /// How many samples there are.
@@ -113,7 +124,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_bucket_holds_what_is_put_in_it_and_is_narrow(late: u32) {
-            let bucket = bucket(late);
+            let bucket = usize::from(bucket(late));
             prop_assert!(bucket < BUCKETS);
             prop_assert!(upper(bucket) >= late);
             prop_assert!(bucket == 0 || upper(bucket - 1) < late);

@@ -99,6 +99,11 @@ impl LinuxBoard {
         }
     }
 
+    /// The board of an MCU. As of the clock ([`crate::clock::Monotonic::shared`]), its functions are in this crate.
+    pub fn boxed(guard: Option<Box<dyn Guard>>, fast: FastGpio) -> Box<dyn Board> {
+        Box::new(LinuxBoard::new(guard, fast))
+    }
+
     fn over(seen: Arc<Mutex<Seen>>, guard: SharedGuard) -> LinuxBoard {
         LinuxBoard {
             seen,

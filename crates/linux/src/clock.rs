@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 use std::io;
 use std::mem;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 use std::thread::{self, Thread};
 use std::time::Duration;
 
@@ -27,6 +27,11 @@ impl Monotonic {
     /// (Klipper's own program takes the next second, so its clock starts near 2^32. The host accepts both.)
     pub fn start() -> Monotonic {
         Monotonic { origin_s: monotonic().as_secs() }
+    }
+
+    /// The clock for an MCU. Its functions are where this is made, in this crate's part of the program (`commands.ld`).
+    pub fn shared(self) -> Arc<dyn TimeSource> {
+        Arc::new(self)
     }
 
     #[inline]

@@ -32,6 +32,7 @@ pub mod guardian;
 mod host;
 pub mod latency;
 mod link;
+pub mod logging;
 mod process;
 mod recorder;
 pub mod status;
@@ -122,16 +123,19 @@ pub struct Options {
     pub sockets: Vec<PathBuf>,
 }
 
-/// Serves a host until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
-/// `board` by `timing`, and `timing` has the clock of the recording. `helpers` has the guardian of
-/// the board's outputs.
+/// Serves a host until SIGTERM, SIGINT or SIGHUP. It calls `ready`, if anybody waits for it, once a host may come. The MCU
+/// drives `board` by `timing`, and `timing` has the clock of the recording. `helpers` has the guardian of the board's
+/// outputs.
+///
+/// It is not generic, so that it is in this crate's part of the program (`commands.ld`).
+#[inline(never)]
 pub fn run(
     options: &Options,
     board: Box<dyn Board>,
     timing: Timing,
     recording: Recording,
     helpers: Helpers,
-    ready: impl FnOnce(),
+    ready: Option<Box<dyn FnOnce() + '_>>,
 ) -> Result<(), Trouble> {
     sys::return_large_blocks();
     let Helpers { guardian, search } = helpers;
@@ -214,7 +218,7 @@ pub fn run(
         None => Ok(()),
     };
     let served = watched.and_then(|()| {
-        ready();
+        ready.into_iter().for_each(|ready| ready());
         link.run().map_err(|error| refused("the link failed, so Pinion ends", error).remedy(LOOK_AT_LOG))
     });
     end(link, core, guardian, served)

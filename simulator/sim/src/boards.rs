@@ -78,7 +78,8 @@ impl Others {
                 let served = || {
                     ready.fetch_add(1, Ordering::SeqCst);
                 };
-                let ended = pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, served);
+                let ended =
+                    pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, Some(Box::new(served)));
                 if let Err(trouble) = &ended {
                     log::error!("{trouble}");
                 }

@@ -238,7 +238,7 @@ pub(crate) fn run(args: &SimArgs) -> ExitCode {
         }
     };
     let timing = board.timing();
-    match pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, ready) {
+    match pinion_runtime::run(&options, Box::new(board), timing, recording, helpers, Some(Box::new(ready))) {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -389,7 +389,7 @@ fn serve(
         }
     };
     let timing = board.timing();
-    let ended = pinion_runtime::run(options, Box::new(board), timing, recording, helpers, ready);
+    let ended = pinion_runtime::run(options, Box::new(board), timing, recording, helpers, Some(Box::new(ready)));
     // A trial that is interrupted ends with this process.
     if let Some(attempt) = owner.as_ref().and_then(|owner| owner.attempt.as_ref()) {
         attempt.running.end();

@@ -551,7 +551,7 @@ fn memory() {
         let kilobytes = session.program.memory_kb();
         figure("Memory of all processes, kB", case, &kilobytes.to_string());
         // A debug build is three times as large.
-        let limit_kb = if cfg!(debug_assertions) { 64 << 10 } else { 9 << 10 };
+        let limit_kb = if cfg!(debug_assertions) { 64 << 10 } else { 7 << 10 };
         assert!(!is_pinion() || kilobytes <= limit_kb);
     }
 }

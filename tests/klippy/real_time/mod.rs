@@ -142,7 +142,7 @@ impl Printer {
                 let options = Options { link, ..options.clone() };
                 thread::spawn(move || {
                     let timing = board.timing();
-                    pinion_runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {})
+                    pinion_runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), None)
                         .unwrap();
                 })
             };

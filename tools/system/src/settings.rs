@@ -91,17 +91,18 @@ enum Command {
     Other(Vec<OsString>),
 }
 
-/// The options of `pinion run` in a command line, such as a running process's. `None` if the command line has another
-/// subcommand.
+/// The options of `pinion run` in a command line, such as a running process's, with the level of the log in `given`. `None`
+/// if the command line has another subcommand.
 ///
 /// # Errors
 ///
 /// The command line is not one of this version of Pinion.
 pub fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<RunArgs>, clap::Error> {
     let line = CommandLine::try_parse_from(arguments)?;
+    let with_level = |args: RunArgs| RunArgs { given: Given { log_level: line.log.log_level, ..args.given }, ..args };
     Ok(match line.command {
-        None => Some(line.run),
-        Some(Command::Run(args)) => Some(*args),
+        None => Some(with_level(line.run)),
+        Some(Command::Run(args)) => Some(with_level(*args)),
         Some(Command::Other(words)) if OTHERS.iter().any(|other| *other == words[0]) => None,
         Some(Command::Other(_)) => return Err(clap::Error::new(ErrorKind::InvalidSubcommand)),
     })

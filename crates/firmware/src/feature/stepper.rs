@@ -229,6 +229,13 @@ impl Stepper {
         self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);
     }
 
+    /// A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
+    #[inline(never)]
+    fn begin_pulse(&self, context: &mut Context) {
+        self.step.flush();
+        context.now();
+    }
+
     /// Changes the direction. The next step waits for the setup time.
     #[inline(never)]
     fn reverse(&mut self, context: &mut Context) -> Result<Next, Shutdown> {
@@ -301,10 +308,8 @@ impl Object for Stepper {
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
-            // A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
             if self.pulse_ticks > Ticks(0) {
-                self.step.flush();
-                context.now();
+                self.begin_pulse(context);
             } else {
                 context.made_edge();
             }

@@ -8,6 +8,7 @@ use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
+use super::timers::NEVER;
 use super::{Batch, Bus, BusCounts, Chip, Context, DeviceId, Finished, Mcu, Oid, Report, State, Timer};
 
 /// The result of an event: when its timer runs next.
@@ -36,7 +37,10 @@ pub trait Object: Any + Send {
     fn kind(&self) -> &'static str;
 
     /// Runs when a timer of this object, due at `at`, fires. An error stops the MCU.
-    fn event(&mut self, _context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, _context: &mut Context, _timer: Timer, _at: Clock) -> Result<Next, Shutdown>
+    where
+        Self: Sized,
+    {
         Ok(Next::Done)
     }
 
@@ -86,6 +90,22 @@ pub trait Object: Any + Send {
     }
 }
 
+/// An object as the table has it.
+pub(super) trait Kept: Object {
+    /// Runs an event. Returns when the timer runs next, or [`NEVER`]: a processor returns this in registers, and the result
+    /// of [`Object::event`] in memory.
+    fn run_event(&mut self, context: &mut Context, timer: Timer, at: Clock) -> Result<Clock, Shutdown>;
+}
+
+impl<T: Object> Kept for T {
+    fn run_event(&mut self, context: &mut Context, timer: Timer, at: Clock) -> Result<Clock, Shutdown> {
+        self.event(context, timer, at).map(|next| match next {
+            Next::At(at) => at,
+            Next::Done => NEVER,
+        })
+    }
+}
+
 /// Highest number of objects with an oid.
 pub(super) const OBJECTS_MAX: usize = 256;
 
@@ -93,7 +113,7 @@ pub(super) const OBJECTS_MAX: usize = 256;
 #[derive(Default)]
 pub(super) struct Objects {
     /// Indexed by oid; feature-owned objects follow.
-    table: Vec<Option<Box<dyn Object>>>,
+    table: Vec<Option<Box<dyn Kept>>>,
     /// The objects that the log names by a pin.
     pins: Vec<(Oid, Pin)>,
 }
@@ -118,17 +138,17 @@ impl Objects {
 
     #[inline]
     pub(super) fn get(&self, oid: Oid) -> Option<&dyn Object> {
-        self.table.get(oid.index())?.as_deref()
+        Some(self.table.get(oid.index())?.as_deref()?)
     }
 
     #[inline]
-    pub(super) fn get_mut(&mut self, oid: Oid) -> Option<&mut Box<dyn Object>> {
-        self.table.get_mut(oid.index())?.as_mut()
+    pub(super) fn get_mut(&mut self, oid: Oid) -> Option<&mut dyn Object> {
+        Some(&mut **self.table.get_mut(oid.index())?.as_mut()?)
     }
 
     /// All objects.
     pub(super) fn iter(&self) -> impl Iterator<Item = &dyn Object> {
-        self.table.iter().flatten().map(|object| &**object)
+        self.table.iter().flatten().map(|object| -> &dyn Object { &**object })
     }
 
     /// The pin by which the log names an object.
@@ -138,12 +158,12 @@ impl Objects {
 
     /// Takes an object out of the table while one of its methods runs.
     #[inline]
-    pub(super) fn take(&mut self, oid: Oid) -> Option<Box<dyn Object>> {
+    pub(super) fn take(&mut self, oid: Oid) -> Option<Box<dyn Kept>> {
         self.table.get_mut(oid.index()).and_then(Option::take)
     }
 
     #[inline]
-    pub(super) fn put_back(&mut self, oid: Oid, object: Box<dyn Object>) {
+    pub(super) fn put_back(&mut self, oid: Oid, object: Box<dyn Kept>) {
         if let Some(slot) = self.table.get_mut(oid.index()) {
             // The place is empty, so nothing has to be dropped.
             mem::forget(slot.replace(object));
@@ -152,7 +172,7 @@ impl Objects {
 
     /// The id of the object of type `T` that a feature owns. It is created at its first use.
     fn own<T: Object + Default>(&mut self) -> Oid {
-        let is_it = |object: &Option<Box<dyn Object>>| {
+        let is_it = |object: &Option<Box<dyn Kept>>| {
             let any = object.as_ref().map(|object| -> &dyn Any { &**object });
             any.is_some_and(|any| any.is::<T>())
         };

@@ -66,7 +66,14 @@ impl PromptLine {
     pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
         // Stored before the call, so that nothing has to be kept through it.
         self.level.set(level);
-        self.line.write(level).inspect_err(|_| self.level.forget())
+        self.line.write(level).map_err(|stop| self.failed(stop))
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn failed(&self, stop: Shutdown) -> Shutdown {
+        self.level.forget();
+        stop
     }
 
     /// Inverts the line.

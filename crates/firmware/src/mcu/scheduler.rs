@@ -8,8 +8,8 @@ use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks, TimeSource, Timing};
 
 use super::stats::Stats;
-use super::timers::Timers;
-use super::{Context, Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
+use super::timers::{NEVER, Timers};
+use super::{Context, Mcu, Note, OBJECTS_MAX, TimerId, WireClock, base};
 
 /// Longest wait within a timer's event. Nothing else runs in that time, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
@@ -92,8 +92,8 @@ impl Scheduler {
         self.last_read
     }
 
-    /// Call this instead of [`Scheduler::now`] after an edge that begins no timed pulse. It reads the time after every fourth
-    /// of them.
+    /// Call this instead of [`Scheduler::now`] after an edge that begins no timed pulse. It reads the time after every
+    /// fourth of them.
     #[inline]
     pub(super) fn made_edge(&mut self) {
         self.untimed += 1;
@@ -207,8 +207,10 @@ impl Scheduler {
         if timer.is_exact() {
             // It is due, so the difference is not negative.
             let late = Ticks((self.last_read.since(at) as u64).min(u32::MAX.into()) as u32);
-            self.lateness.record(late);
+            self.lateness.count(late);
+            // The latest since somebody asked is never later than the latest of all.
             if late > self.latest.late {
+                self.lateness.note_longest(late);
                 self.latest = Latest { late, oid: timer.oid().number() };
             }
         }
@@ -255,9 +257,12 @@ impl Mcu {
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.state.scheduler.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
             let scheduler = &mut self.state.scheduler;
-            let Some((at, timer)) =
-                scheduler.timers.first().filter(|(at, _)| *at <= scheduler.last_read || *at <= scheduler.now())
-            else {
+            let due = scheduler.timers.due(scheduler.last_read);
+            let Some((at, timer)) = due.or_else(|| {
+                let now = scheduler.now();
+                scheduler.timers.due(now)
+            }) else {
+                scheduler.timing.due.set(None);
                 scheduler.is_behind = false;
                 return false;
             };
@@ -268,6 +273,7 @@ impl Mcu {
                 self.run_timer(at, timer);
             }
         }
+        self.state.scheduler.timing.due.set(None);
         let next = self.state.scheduler.timers.next();
         let late = next.map_or(0, |at| self.now().since(at));
         if let Some(next) = next.filter(|_| late > i64::from(self.state.scheduler.timing.late_limit.0))
@@ -292,17 +298,16 @@ impl Mcu {
         let oid = timer.oid();
         let Some(mut object) = self.state.objects.take(oid) else { return self.run_own_timer(timer, at) };
         self.state.scheduler.timing.due.set(Some(at));
-        let result = object.event(&mut Context::new(&mut self.state, oid), timer.timer(), at);
-        self.state.scheduler.timing.due.set(None);
-        match result {
+        match object.run_event(&mut Context::new(&mut self.state, oid), timer.timer(), at) {
             Ok(next) => {
-                match next {
-                    Next::At(at) => self.state.scheduler.timers.repeat(at, timer),
-                    Next::Done => self.state.scheduler.timers.pop(),
-                }
                 self.state.objects.put_back(oid, object);
+                match next {
+                    NEVER => self.state.scheduler.timers.pop(),
+                    next => self.state.scheduler.timers.repeat(next, timer),
+                }
             }
             Err(stop) => {
+                self.state.scheduler.timing.due.set(None);
                 self.state.scheduler.timers.pop();
                 let stop = self.state.blame(stop, object.kind(), oid);
                 self.state.objects.put_back(oid, object);
@@ -322,7 +327,6 @@ impl Mcu {
             _ => {}
         }
         self.state.scheduler.timers.pop();
-        self.state.scheduler.timing.due.set(None);
     }
 
     /// Counts a span in which the core was busy.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The waiting timers: a queue ordered by due time, then by insertion order.
 
-use std::mem;
+use std::{iter, mem};
 
 use crate::time::Clock;
 
@@ -74,49 +74,64 @@ impl TimerId {
 /// Only a few dozen timers run at once, so a sorted array is faster than a more complex queue.
 #[derive(Debug)]
 pub(super) struct Timers {
-    /// The next timer is at the end, so taking it moves nothing.
-    waiting: Vec<(Clock, TimerId)>,
-    /// The next timer runs. It keeps its place, because it mostly gets the same one again.
+    /// The next timer; [`NONE`] without one. A timer that runs alone mostly becomes the next one again.
+    next: Waiting,
+    /// The others. The first of them is at the end, so taking it moves nothing.
+    others: Vec<Waiting>,
+    /// The next timer runs. It keeps its place until it is known when it runs again.
     is_running: bool,
 }
+
+/// A timer and its due time.
+type Waiting = (Clock, TimerId);
+
+/// A time that does not come. It is 11,000 years ahead.
+pub(super) const NEVER: Clock = Clock::from_bits(u64::MAX);
+
+/// Stands for the next timer if there is none.
+const NONE: Waiting = (NEVER, TimerId::own(u8::MAX >> 1));
 
 impl Timers {
     /// A queue for `capacity` timers without allocation.
     pub(super) fn with_capacity(capacity: usize) -> Timers {
-        Timers { waiting: Vec::with_capacity(capacity), is_running: false }
+        Timers { next: NONE, others: Vec::with_capacity(capacity), is_running: false }
     }
 
     pub(super) fn reserve(&mut self, capacity: usize) {
-        self.waiting.reserve(capacity.saturating_sub(self.waiting.len()));
+        self.others.reserve(capacity.saturating_sub(self.others.len()));
     }
 
     /// The due time of the next timer.
     #[inline]
     pub(super) fn next(&self) -> Option<Clock> {
-        self.waiting.last().map(|(at, _)| *at)
+        Some(self.next.0).filter(|at| *at != NEVER)
     }
 
     /// The due time of the next exact timer.
     #[inline]
     pub(super) fn next_exact(&self) -> Option<Clock> {
-        self.waiting.iter().rev().find(|(_, timer)| timer.is_exact()).map(|(at, _)| *at)
+        self.in_order().find(|(_, timer)| timer.is_exact()).map(|(at, _)| at)
     }
 
     /// Whether the next timer has the due time of the one after it.
     #[inline]
     pub(super) fn has_several_next(&self) -> bool {
-        matches!(self.waiting.as_slice(), [.., (other, _), (next, _)] if other == next)
+        self.others.last().is_some_and(|(other, _)| *other == self.next.0)
     }
 
     /// The timers with this due time, if they are the next ones, in their order.
     pub(super) fn of_instant(&self, at: Clock) -> impl Iterator<Item = TimerId> {
-        self.waiting.iter().rev().take_while(move |(of, _)| *of == at).map(|(_, timer)| *timer)
+        self.in_order().take_while(move |(of, _)| *of == at).map(|(_, timer)| timer)
     }
 
-    /// The next timer and its due time.
+    fn in_order(&self) -> impl Iterator<Item = Waiting> {
+        iter::once(self.next).filter(|next| *next != NONE).chain(self.others.iter().rev().copied())
+    }
+
+    /// The next timer, if it is due at `now`, and its due time.
     #[inline]
-    pub(super) fn first(&self) -> Option<(Clock, TimerId)> {
-        self.waiting.last().copied()
+    pub(super) fn due(&self, now: Clock) -> Option<(Clock, TimerId)> {
+        Some(self.next).filter(|(at, _)| *at <= now)
     }
 
     /// The next timer runs now, until [`Timers::pop`] or [`Timers::repeat`].
@@ -129,58 +144,68 @@ impl Timers {
     #[inline]
     pub(super) fn pop(&mut self) {
         self.is_running = false;
-        self.waiting.pop();
+        self.next = self.others.pop().unwrap_or(NONE);
     }
 
     /// The running timer, which is this one, runs again at this time, after those with the same due time.
-    #[inline]
+    #[inline(always)]
     pub(super) fn repeat(&mut self, at: Clock, timer: TimerId) {
         self.is_running = false;
-        self.settle(at, timer);
+        self.next = (at, timer);
+        if let Some(other) = self.others.last().filter(|other| other.0 <= at) {
+            self.next = *other;
+            self.settle(at, timer);
+        }
     }
 
     /// Inserts a timer after those with the same due time. A timer waits at most once, and the running one keeps its
     /// place. So there is at most one entry more than timers.
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
-        self.change(|timers| {
-            debug_assert!(!timers.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} already waits");
-            timers.waiting.push((at, timer));
-            timers.settle(at, timer);
-        });
+        debug_assert!(
+            self.in_order().skip(self.is_running.into()).all(|(_, waiting)| waiting != timer),
+            "{timer:?} already waits"
+        );
+        if !self.is_running && at < self.next.0 {
+            let later = mem::replace(&mut self.next, (at, timer));
+            self.others.extend(Some(later).filter(|later| *later != NONE));
+        } else {
+            self.others.push((at, timer));
+            self.settle(at, timer);
+        }
     }
 
-    /// Puts a timer into its place. The last entry of the queue is free for that.
-    #[inline]
+    /// Puts a timer into its place among the others. Their last entry is free for that.
+    #[inline(always)]
     fn settle(&mut self, at: Clock, timer: TimerId) {
-        let mut waiting = self.waiting.as_mut_slice();
+        let mut others = self.others.as_mut_slice();
         // Its place is usually near the end, so moving entries one by one is faster than memmove.
-        while let [earlier @ .., free] = waiting
+        while let [earlier @ .., free] = others
             && let Some(before) = earlier.last()
             && before.0 <= at
         {
             *free = *before;
-            waiting = earlier;
+            others = earlier;
         }
-        if let [.., free] = waiting {
+        if let [.., free] = others {
             *free = (at, timer);
         }
     }
 
+    /// Removes a timer, unless it runs.
     pub(super) fn remove(&mut self, timer: TimerId) {
-        self.change(|timers| timers.waiting.retain(|(_, waiting)| *waiting != timer));
+        self.retain(|waiting| waiting != timer);
     }
 
-    /// Removes the timers of objects.
+    /// Removes the timers of objects, without the running one.
     pub(super) fn clear(&mut self) {
-        self.change(|timers| timers.waiting.retain(|(_, timer)| timer.oid == Oid::NONE));
+        self.retain(|timer| timer.oid == Oid::NONE);
     }
 
-    /// Changes the waiting timers, without the running one.
-    fn change(&mut self, change: impl FnOnce(&mut Timers)) {
-        let running = if mem::take(&mut self.is_running) { self.waiting.pop() } else { None };
-        change(self);
-        self.waiting.extend(running);
-        self.is_running = running.is_some();
+    fn retain(&mut self, keeps: impl Fn(TimerId) -> bool) {
+        self.others.retain(|(_, timer)| keeps(*timer));
+        if !self.is_running && !keeps(self.next.1) {
+            self.pop();
+        }
     }
 }
 
@@ -202,7 +227,7 @@ mod tests {
                 timers.insert(*at, *timer);
             }
             expected.sort_by_key(|(at, _)| *at);
-            let got: Vec<_> = std::iter::from_fn(|| timers.first().inspect(|_| timers.pop())).collect();
+            let got: Vec<_> = iter::from_fn(|| timers.due(Clock::from_ticks(20)).inspect(|_| timers.pop())).collect();
             prop_assert_eq!(got, expected);
         }
 
@@ -216,7 +241,7 @@ mod tests {
                 queue.insert(Clock::from_ticks(10), TimerId::of(Oid::new(255), Timer::exact(0)));
             }
             for (number, (starts, removes, again)) in (0..).zip(steps) {
-                let Some((_, timer)) = timers.first() else { break };
+                let Some((_, timer)) = timers.due(Clock::from_ticks(20)) else { break };
                 timers.run();
                 taken.pop();
                 for queue in [&mut timers, &mut taken] {
@@ -230,7 +255,7 @@ mod tests {
                     }
                     None => timers.pop(),
                 }
-                prop_assert_eq!(&timers.waiting, &taken.waiting);
+                prop_assert_eq!(timers.in_order().collect::<Vec<_>>(), taken.in_order().collect::<Vec<_>>());
             }
         }
     }

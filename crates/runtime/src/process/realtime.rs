@@ -55,7 +55,7 @@ const LOCKED: MlockAllFlags =
     MlockAllFlags::MCL_CURRENT.union(MlockAllFlags::MCL_FUTURE).union(MlockAllFlags::from_bits_retain(4));
 /// How much stack is touched: more than our threads use. With all parts of the simulated printer, in a debug build, the
 /// core used 28 kB and a worker 12 kB (the `Rss` of their stacks in /proc/PID/smaps, when nothing was touched).
-const STACK_BYTES: usize = 64 * 1024;
+const STACK_BYTES: usize = 32 * 1024;
 /// The calling thread, for the scheduling calls.
 const MYSELF: Pid = Pid::from_raw(0);
 /// Numbers of capabilities (linux/capability.h).

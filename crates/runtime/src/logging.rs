@@ -26,7 +26,8 @@ use nix::unistd::write;
 
 use pinion_linux::clock::monotonic;
 use pinion_linux::foreign::plain;
-use pinion_runtime::started;
+
+use crate::started;
 
 /// Highest number of lines that may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
