@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The sections of the program whose pages a program that serves a host gives back (`commands.ld`).
+//! The sections of the program whose pages a program that serves a host gives back (`build.rs`).
 
 use std::fs::{self, File};
 use std::ops::Range;
@@ -77,7 +77,7 @@ fn no_crate_whose_functions_are_given_back_is_one_of_the_service() {
     let list = String::from_utf8_lossy(&list.stdout).into_owned();
     let serve: Vec<String> = list.lines().filter_map(|line| Some(line.split(' ').next()?.replace('-', "_"))).collect();
     assert!(serve.iter().any(|name| name == "pinion_firmware"), "{list}");
-    let script = include_str!("../../commands.ld");
+    let script = include_str!(concat!(env!("OUT_DIR"), "/commands.ld"));
     // The crate's name stands before the mark of its hash.
     let names = script.lines().filter_map(|line| line.trim().strip_prefix("*.")?.split('-').next());
     let given_back: Vec<&str> = names.collect();

@@ -29,7 +29,7 @@ impl Monotonic {
         Monotonic { origin_s: monotonic().as_secs() }
     }
 
-    /// The clock for an MCU. Its functions are where this is made, in this crate's part of the program (`commands.ld`).
+    /// The clock for an MCU. Its functions are where this is made, in this crate's part of the program (`build.rs`).
     pub fn shared(self) -> Arc<dyn TimeSource> {
         Arc::new(self)
     }

@@ -127,7 +127,7 @@ pub struct Options {
 /// drives `board` by `timing`, and `timing` has the clock of the recording. `helpers` has the guardian of the board's
 /// outputs.
 ///
-/// It is not generic, so that it is in this crate's part of the program (`commands.ld`).
+/// It is not generic, so that it is in this crate's part of the program (`build.rs`).
 #[inline(never)]
 pub fn run(
     options: &Options,

@@ -17,7 +17,7 @@ pub fn trim_heap() {
 }
 
 /// Sections of the program's file that a program that serves a host does not use any more: the functions and constants of
-/// the other subcommands (`commands.ld`), the addresses that the dynamic linker has relocated, and what a panic needs, which
+/// the other subcommands (`build.rs`), the addresses that the dynamic linker has relocated, and what a panic needs, which
 /// ends the program.
 const USED_UP: [&str; 6] =
     [".text.commands", ".rodata.commands", ".rela.dyn", ".eh_frame_hdr", ".eh_frame", ".gcc_except_table"];
