@@ -229,13 +229,6 @@ impl Stepper {
         self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);
     }
 
-    /// A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
-    #[inline(never)]
-    fn begin_pulse(&self, context: &mut Context) {
-        self.step.flush();
-        context.now();
-    }
-
     /// Changes the direction. The next step waits for the setup time.
     #[inline(never)]
     fn reverse(&mut self, context: &mut Context) -> Result<Next, Shutdown> {
@@ -308,8 +301,10 @@ impl Object for Stepper {
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
+            // A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
             if self.pulse_ticks > Ticks(0) {
-                self.begin_pulse(context);
+                self.step.flush();
+                context.now();
             } else {
                 context.made_edge();
             }
