@@ -33,9 +33,9 @@ use vm::Run;
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
-/// Highest number of tests in one VM. The start of a VM takes as long as several tests: it reads the snapshot, and its
-/// emulator translates all code again.
-const TESTS_IN_A_VM: usize = 64;
+/// Highest number of tests in one VM. The start of a VM takes as long as several tests. With more VMs than processors,
+/// no processor is idle while another one has half of its work left.
+const TESTS_IN_A_VM: usize = 32;
 
 /// Tests with figures that are compared with another run or another program. They have their own VM, so that their
 /// figures do not depend on earlier tests. They take long, and run only if a filter asks for them.
