@@ -158,18 +158,18 @@ fn not_taken(name: &str, error: &io::Error) -> Shutdown {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use pinion_firmware::board::Direction;
 
     /// The calls to the guardian, and whether it refuses them from now on.
     #[derive(Default)]
-    struct Seen {
-        calls: Vec<String>,
-        refuses: bool,
+    pub struct Seen {
+        pub calls: Vec<String>,
+        pub refuses: bool,
     }
 
-    struct Fake(Arc<Mutex<Seen>>);
+    pub struct Fake(pub Arc<Mutex<Seen>>);
 
     impl Fake {
         fn did(&mut self, call: String) -> io::Result<()> {
@@ -184,8 +184,8 @@ mod tests {
             self.did(format!("{name}: {}", value.get()))
         }
 
-        fn files(&mut self, _: &str, _: &[(RawFd, &[u8])]) -> io::Result<()> {
-            Ok(())
+        fn files(&mut self, name: &str, _: &[(RawFd, &[u8])]) -> io::Result<()> {
+            self.did(format!("files of {name}"))
         }
 
         fn forget(&mut self, name: &str) -> io::Result<()> {

@@ -234,7 +234,9 @@ fn trouble(error: &io::Error, cause: String) -> Trouble {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::guard::tests::{Fake, Seen};
     use pinion_firmware::board::{Pin, Pwm as _, ShutdownValue};
+    use std::sync::{Arc, Mutex};
 
     const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
 
@@ -279,30 +281,11 @@ mod tests {
         assert_eq!(state("enable"), "0");
     }
 
-    struct Lost;
-
-    impl crate::Guard for Lost {
-        fn output(&mut self, _: &str, _: i32, _: ShutdownValue<bool>, _: Option<&str>) -> io::Result<()> {
-            Ok(())
-        }
-
-        fn files(&mut self, _: &str, _: &[(i32, &[u8])]) -> io::Result<()> {
-            Err(io::Error::other("it is gone"))
-        }
-
-        fn forget(&mut self, _: &str) -> io::Result<()> {
-            Ok(())
-        }
-
-        fn release(&mut self) -> io::Result<()> {
-            Ok(())
-        }
-    }
-
     #[test]
     fn a_channel_that_the_guardian_does_not_take_is_not_switched_on() {
         let class = class(true);
-        let error = Pwm::open(class.path(), CHANNEL, &config(8192), SharedGuard::new(Some(Box::new(Lost))));
+        let lost = Fake(Arc::new(Mutex::new(Seen { refuses: true, ..Seen::default() })));
+        let error = Pwm::open(class.path(), CHANNEL, &config(8192), SharedGuard::new(Some(Box::new(lost))));
         assert_eq!(error.err().unwrap().reason, reason::GUARDIAN_LOST);
         assert_eq!((read(&class, "duty_cycle"), read(&class, "enable")), (String::new(), String::new()));
     }
