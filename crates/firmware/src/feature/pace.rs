@@ -39,10 +39,16 @@ impl Pace {
         Pace::of(context.clock())
     }
 
+    /// The pace of an object whose jobs begin between two ticks ([`Pace::until_between_ticks`]).
+    pub(super) fn between_ticks(context: &Context) -> Pace {
+        let pace = Pace::new(context);
+        // This starts the search for the kernel's tick, which is over before the first message.
+        let _ = pace.clock.tick_after(pace.now());
+        pace
+    }
+
     /// A pace with this clock.
     pub(super) fn of(clock: Arc<dyn TimeSource>) -> Pace {
-        // This starts the search for the kernel's tick, which is over before the first message.
-        let _ = clock.tick_after(clock.now());
         Pace { clock, stopped: Arc::default() }
     }
 

@@ -212,7 +212,7 @@ fn lines(context: &mut Context, rx_pin: Pin, tx_pin: Pin, bias: Bias, bit: Ticks
     } else {
         (context.prompt_line(tx_pin, "UART", Direction::at_rest(true))?, None)
     };
-    let lines = Lines { wire: Wire { tx, single }, rx, pace: Pace::new(context), bit, spoilt: false };
+    let lines = Lines { wire: Wire { tx, single }, rx, pace: Pace::between_ticks(context), bit, spoilt: false };
     lines.wire.idle()?;
     Ok(lines)
 }

@@ -123,7 +123,7 @@ impl Pulses {
             let cause = format!("a chain of {size} bytes is too long for a line, which takes {SIZE_MAX}");
             return Err(Shutdown::because(INVALID_SIZE, cause).remedy("lower chain_count").of(&name));
         }
-        let pace = Pace::new(context);
+        let pace = Pace::between_ticks(context);
         let free_at = pace.now() + reset;
         Ok(Pulses { line, pace, limits, reset, free_at, name, has_warned: false, warning: None })
     }
