@@ -31,7 +31,7 @@ pub use figures::{EdgeCost, Figures, HalfFigures, LateUs, Latency};
 #[derive(Args, Clone, Debug)]
 pub(crate) struct LatencyArgs {
     /// How long to measure, in seconds: half of it idle, half under load
-    #[arg(long, value_name = "N", default_value_t = 10, value_hint = clap::ValueHint::Other, value_parser = clap::value_parser!(u32).range(2..=3600))]
+    #[arg(long, value_name = "N", default_value_t = 10, value_hint = clap::ValueHint::Other, value_parser = clap::value_parser!(u32).range(1..=3600))]
     seconds: u32,
     /// Draw the histograms
     #[arg(long, value_name = "FILE")]

@@ -59,6 +59,9 @@ pub(super) struct DoctorArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    /// Leave out the latency, which takes two seconds
+    #[arg(long)]
+    no_latency: bool,
     /// Check the system whose files are below DIR, for example a mounted card
     #[arg(long, value_name = "DIR", default_value = "/", value_hint = ValueHint::DirPath)]
     root: PathBuf,
@@ -77,7 +80,7 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
         Ok(found) => found,
         Err(why) => return failed(why),
     };
-    let mut groups = quietly(|| examine(&computer, board.as_ref()));
+    let mut groups = quietly(|| examine(&computer, board.as_ref(), !args.no_latency));
     if let Some(checkout) = &checkout {
         groups.push(Group::new("checkout", vec![klipper::finding(checkout)]));
     }
@@ -93,7 +96,7 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
     report::finish(&page, &groups)
 }
 
-fn examine(computer: &Computer, board: Option<&Board>) -> Vec<Group> {
+fn examine(computer: &Computer, board: Option<&Board>, measures: bool) -> Vec<Group> {
     let (instances, configurations) = instance::instances(computer);
     let klippys = klippys(computer);
     let uarts = host::of_all(&klippys, Printer::uarts);
@@ -135,7 +138,9 @@ fn examine(computer: &Computer, board: Option<&Board>) -> Vec<Group> {
         let pins = host::of_all(&klippys, Printer::numbered);
         let pins = lines::of_instances(&instances, &pins);
         groups.insert(7, Group::new("lines", lines::header(computer, inventory, &pins)));
-        groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
+        if measures {
+            groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
+        }
     }
     groups
 }
@@ -176,7 +181,7 @@ pub(crate) mod tests {
     #[test]
     fn a_computer_without_any_files_has_no_errors() {
         let tree = Tree::empty();
-        let groups = examine(&tree.computer(), None);
+        let groups = examine(&tree.computer(), None, true);
         let errors: Vec<&Finding> =
             groups.iter().flat_map(|group| &group.findings).filter(|finding| finding.status == Level::Error).collect();
         assert!(errors.is_empty(), "{errors:?}");
@@ -205,7 +210,7 @@ pub(crate) mod tests {
         ] {
             tree.put(path, text);
         }
-        examine(&tree.computer(), None);
+        examine(&tree.computer(), None, true);
         // A pipe without a writer, and a folder in a file's place.
         let pipe = tree.computer().path("/sys/kernel/realtime");
         fs::create_dir_all(pipe.parent().unwrap()).unwrap();
@@ -214,8 +219,8 @@ pub(crate) mod tests {
         // Processes that call themselves Pinion and klippy, and name the pipe.
         tree.process(7, &["/tmp/pinion", "run", "--config", "/sys/kernel/realtime"], 65534, &[]);
         tree.process(8, &["python3", "/tmp/klippy.py", "/sys/kernel/realtime"], 65534, &[]);
-        examine(&tree.computer(), None);
-        examine(&tree.called_by(65534), None);
+        examine(&tree.computer(), None, true);
+        examine(&tree.called_by(65534), None, true);
     }
 
     #[test]
@@ -241,7 +246,7 @@ pub(crate) mod tests {
         tree.put("proc/device-tree/model", name);
         tree.put("sys/devices/system/cpu/isolated", name);
         tree.link("tmp/klipper_host_mcu", &format!("/dev/{name}"));
-        let groups = examine(&tree.computer(), None);
+        let groups = examine(&tree.computer(), None, true);
         let page = report::text(&groups);
         pinion_testkit::names::assert_plain(&page.to_string(), page.lines().count());
         let is_ours = |line: &str| {

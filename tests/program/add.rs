@@ -100,6 +100,14 @@ impl Card {
         Card::of("Raspberry Pi 4 Model B Rev 1.4", &[("boot/firmware/config.txt", CONFIG_TXT)])
     }
 
+    /// Another card with the same files.
+    fn copy(&self) -> Card {
+        let card = Card(tempfile::tempdir().unwrap());
+        let copied = Command::new("cp").arg("-a").arg(self.0.path().join(".")).arg(card.0.path()).status();
+        assert!(copied.unwrap().success());
+        card
+    }
+
     pub(crate) fn path(&self, path: &str) -> PathBuf {
         self.0.path().join(path)
     }
@@ -156,7 +164,7 @@ impl Card {
                     folders.push(path.clone());
                 }
                 let bytes = if about.is_file() { fs::read(&path).unwrap() } else { Vec::new() };
-                found.push((path, bytes, about.mode()));
+                found.push((path.strip_prefix(self.0.path()).unwrap().to_owned(), bytes, about.mode()));
             }
         }
         found.sort();
@@ -539,21 +547,29 @@ fn a_device_that_goes_takes_nothing_from_the_others() {
         (&with_overlays, [&["sht"], &["adxl345"], &["bme280"]]),
     ];
     for (env, devices) in cards {
-        for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
-            let card = card_with(env);
-            card.put("etc/modules-load.d/cups-filters.conf", "lp\n");
-            let before = card.snapshot();
-            devices.iter().for_each(|device| drop(card.added(&[*device, &["--yes"]].concat())));
-            for (done, gone) in order.iter().enumerate() {
-                let printed = card.added(&[devices[*gone][0], "--undo", "--yes"]);
-                let now = card.snapshot();
-                for left in &order[done + 1..] {
-                    let again = card.added(&[devices[*left], &["--yes"]].concat());
-                    assert!(again.contains("Nothing is left to change."), "{order:?} {gone}: {printed}{again}");
-                    assert_eq!(card.snapshot(), now, "{devices:?} {order:?}: {gone} goes, {left} stays");
-                }
+        let card = card_with(env);
+        card.put("etc/modules-load.d/cups-filters.conf", "lp\n");
+        let before = card.snapshot();
+        devices.iter().for_each(|device| drop(card.added(&[*device, &["--yes"]].concat())));
+        // Cards, and the devices on them.
+        let mut cards = vec![(card, devices.to_vec())];
+        while let Some((card, devices)) = cards.pop() {
+            if devices.is_empty() {
+                assert_eq!(card.snapshot(), before);
             }
-            assert_eq!(card.snapshot(), before, "{devices:?} {order:?}");
+            for gone in 0..devices.len() {
+                let card = card.copy();
+                let mut left = devices.clone();
+                let gone = left.remove(gone)[0];
+                let printed = card.added(&[gone, "--undo", "--yes"]);
+                let now = card.snapshot();
+                for device in &left {
+                    let again = card.added(&[*device, &["--yes"]].concat());
+                    assert!(again.contains("Nothing is left to change."), "{devices:?} {gone}: {printed}{again}");
+                    assert_eq!(card.snapshot(), now, "{devices:?}: {gone} goes, {device:?} stays");
+                }
+                cards.push((card, left));
+            }
         }
     }
 }
@@ -627,9 +643,9 @@ const OLD_CHANGES: [i64; 2] = [libc::SYS_rename, libc::SYS_unlink];
 #[cfg(not(target_arch = "x86_64"))]
 const OLD_CHANGES: [i64; 0] = [];
 
-/// Runs `pinion` and kills it before this change. False if it ends before: waitpid(2) has taken it then.
+/// Runs `pinion`, and stops it before each of its changes for a look at them.
 #[allow(clippy::zombie_processes)]
-fn is_killed_before(change: usize, arguments: &[String]) -> bool {
+fn before_each_change(arguments: &[String], mut look: impl FnMut()) {
     // It begins when it is traced.
     let mut begin = Command::new("sh");
     begin.args(["-c", "read begin; exec \"$@\"", "sh"]).arg(pinion_path()).args(arguments);
@@ -639,10 +655,10 @@ fn is_killed_before(change: usize, arguments: &[String]) -> bool {
     ptrace::seize(pid, ptrace::Options::PTRACE_O_TRACESYSGOOD | ptrace::Options::PTRACE_O_EXITKILL).unwrap();
     ptrace::interrupt(pid).unwrap();
     child.stdin.take().unwrap().write_all(b"begin\n").unwrap();
-    let (mut seen, mut is_inside) = (0, false);
+    let mut is_inside = false;
     loop {
         let signal = match waitpid(pid, None).unwrap() {
-            WaitStatus::Exited(..) | WaitStatus::Signaled(..) => return false,
+            WaitStatus::Exited(_, code) => return assert_eq!(code, 0),
             WaitStatus::PtraceSyscall(_) => {
                 is_inside = !is_inside;
                 let call = fs::read_to_string(format!("/proc/{pid}/syscall")).unwrap();
@@ -650,49 +666,42 @@ fn is_killed_before(change: usize, arguments: &[String]) -> bool {
                 let number = fields.next().and_then(|number| number.parse().ok()).unwrap_or(-1);
                 let is_change = CHANGES.contains(&number) || OLD_CHANGES.contains(&number);
                 // Its own output changes no file.
-                seen += usize::from(is_inside && is_change && !matches!(fields.next(), Some("0x1" | "0x2")));
+                if is_inside && is_change && !matches!(fields.next(), Some("0x1" | "0x2")) {
+                    look();
+                }
                 None
             }
             WaitStatus::Stopped(_, signal) => Some(signal),
+            WaitStatus::Signaled(_, signal, _) => panic!("ended by {signal}"),
             _ => None,
         };
-        if seen == change {
-            child.kill().unwrap();
-            return child.wait().unwrap().code().is_none();
-        }
         ptrace::syscall(pid, signal).unwrap();
     }
 }
 
-/// Kills the program before each of its changes. Each file is the old or the new one, and a later call finishes.
+/// A program that is killed leaves the files as they are at that moment. Before each of its changes, each file is the old
+/// or the new one, and a later call finishes.
 #[test]
 fn a_kill_leaves_each_file_old_or_new() {
-    let whole = Card::pi();
-    whole.added(&["adxl345", "--yes"]);
-    for undoes in [false, true] {
-        let mut killed = 0;
-        for change in 1.. {
-            let card = Card::pi();
-            let before = card.snapshot();
-            if undoes {
-                card.added(&["adxl345", "--yes"]);
-            }
-            let arguments =
-                card.arguments(if undoes { &["adxl345", "--yes", "--undo"] } else { &["adxl345", "--yes"] });
-            if !is_killed_before(change, &arguments) {
-                break;
-            }
-            killed += 1;
+    let old = Card::pi();
+    let before = old.snapshot();
+    let new = old.copy();
+    new.added(&["adxl345", "--yes"]);
+    for (card, undo) in [(old.copy(), None), (new.copy(), Some("--undo"))] {
+        let args: Vec<&str> = ["adxl345", "--yes"].into_iter().chain(undo).collect();
+        let mut killed = Vec::new();
+        before_each_change(&card.arguments(&args), || killed.push(card.copy()));
+        assert_eq!(card.snapshot(), if undo.is_none() { new.snapshot() } else { before.clone() });
+        assert!(killed.len() > 3, "killed {} times", killed.len());
+        for (change, card) in killed.iter().enumerate() {
             for path in [PRINTER, "boot/firmware/config.txt"] {
-                let old = if path == PRINTER { PRINTER_CFG } else { CONFIG_TXT };
                 let now = card.read(path);
-                assert!(now == old || now == whole.read(path), "before change {change}: {path}: {now}");
+                assert!(now == old.read(path) || now == new.read(path), "before change {change}: {path}: {now}");
             }
             card.added(&["adxl345", "--yes"]);
             card.added(&["adxl345", "--undo", "--yes"]);
             assert!(card.snapshot() == before, "before change {change}: something is left");
         }
-        assert!(killed > 3, "killed {killed} times");
     }
 }
 

@@ -245,7 +245,7 @@ fn the_latency_is_not_measured_while_a_host_may_print() {
         let pinion = Pinion::start(&["run", "--dialect", "master"]);
         pinion.wait_for_link();
         let client = pinion.client();
-        let refused = output(&["latency", "--seconds", "2"]);
+        let refused = output(&["latency", "--seconds", "1"]);
         let text = String::from_utf8(refused.stderr).unwrap();
         assert_eq!((refused.status.code(), refused.stdout.len()), (Some(1), 0), "{text}");
         for part in [
@@ -255,7 +255,7 @@ fn the_latency_is_not_measured_while_a_host_may_print() {
             assert!(text.contains(&part), "no \"{part}\" in: {text}");
         }
         drop(client);
-        let measured = output(&["latency", "--seconds", "2"]);
+        let measured = output(&["latency", "--seconds", "1"]);
         assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
     });
 }
@@ -264,13 +264,13 @@ fn the_latency_is_not_measured_while_a_host_may_print() {
 fn latency_judges_the_computer() {
     here::among_own_processes("commands::latency_judges_the_computer", || {
         let (_folder, svg) = folder_with("latency.svg", "");
-        let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
+        let measured = output(&["latency", "--seconds", "1", "--svg", svg.to_str().unwrap()]);
         let text = String::from_utf8(measured.stdout).unwrap();
         assert!(measured.status.success(), "{text}");
         for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: ", "to share: Pinion "] {
             assert!(text.contains(part), "no \"{part}\" in:\n{text}");
         }
-        let measured = output(&["latency", "--seconds", "2", "--json"]);
+        let measured = output(&["latency", "--seconds", "1", "--json"]);
         let figures: Value = serde_json::from_slice(&measured.stdout).unwrap();
         let latency = &figures["latency"];
         assert!(latency["fit_for_steppers"].is_boolean() && figures["computer"].is_string(), "{figures}");
@@ -289,7 +289,7 @@ fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
             &["sim", "--print-board"],
             &["dict", "--board", "sim"],
             &["pins"],
-            &["latency", "--seconds", "2"],
+            &["latency", "--seconds", "1"],
         ] {
             let child =
                 Command::new(pinion_path()).args(args).stdout(closed_pipe()).stderr(Stdio::piped()).spawn().unwrap();

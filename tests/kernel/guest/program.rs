@@ -222,7 +222,7 @@ impl Drop for Program {
         let _ = self.child.wait();
         let until = Instant::now() + WAIT_MAX;
         while guardian.is_some_and(exists) && Instant::now() < until {
-            thread::sleep(Duration::from_millis(1));
+            thread::sleep(sysfs::POLL_INTERVAL);
         }
         if thread::panicking() {
             println!("--- log of the program\n{}---", fs::read_to_string(&self.log).unwrap_or_default());

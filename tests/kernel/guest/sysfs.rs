@@ -8,6 +8,9 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
+/// An idle guest's time passes at once, and a look costs an emulated processor much. No multiple of a PWM's cycle.
+pub const POLL_INTERVAL: Duration = Duration::from_millis(13);
+
 /// Tests write to any hardware that they find. That is allowed in the guest only.
 pub fn assert_in_guest() {
     assert!(
@@ -69,6 +72,6 @@ pub fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(10);
     while !condition() {
         assert!(Instant::now() < deadline, "waited in vain until {what}");
-        thread::sleep(Duration::from_millis(5));
+        thread::sleep(POLL_INTERVAL);
     }
 }

@@ -40,6 +40,7 @@ fn a_channel_is_exported_and_driven() {
     run(client, &format!("queue_pwm_out oid=0 clock={at} value=16384"));
     assert_eq!(shutdown_of(client), "Missed scheduling of next hard pwm event");
     sysfs::wait_until("it is switched off", || pwm::output(6) == "6 100000 50000 0");
+    drop(program);
     sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 
@@ -48,19 +49,19 @@ fn a_channel_is_exported_and_driven() {
 fn a_channel_that_runs_is_configured_anew_without_a_moment_off() {
     let part = |(period, duty, enabled): (u64, u64, bool)| if enabled { duty as f64 / period as f64 } else { 0.0 };
     for (before, after) in [(50_000, 50_000), (50_000, 5_000), (5_000, 50_000), (50_000, 40_000), (40_000, 50_000)] {
-        // In a separate instance, as after an upgrade.
-        let first = Program::start();
-        configure(&mut first.connect(), 1, &[config("pwmchip0/pwm6", before)]);
-        drop(first);
-        sysfs::write(format!("{CHIP}/pwm6/enable"), "1");
+        // As a former program left it, such as before an upgrade.
+        sysfs::write(format!("{CHIP}/export"), "6");
+        for (file, value) in [("period", before * 20), ("duty_cycle", before * 5), ("enable", 1)] {
+            sysfs::write(format!("{CHIP}/pwm6/{file}"), value.to_string());
+        }
         pwm::forget();
-        let second = Program::start();
-        configure(&mut second.connect(), 1, &[config("pwmchip0/pwm6", after)]);
+        let program = Program::start();
+        configure(&mut program.connect(), 1, &[config("pwmchip0/pwm6", after)]);
         let history = pwm::history(6);
         assert_eq!(pwm::output(6), format!("6 {} {} 1", after * 20, after * 5));
         assert_eq!(history.is_empty(), before == after, "{history:?}");
         assert!(history.iter().map(|state| part(*state)).all(|part| part > 0.0 && part <= 0.25), "{history:?}");
-        drop(second);
+        drop(program);
         sysfs::write(format!("{CHIP}/unexport"), "6");
     }
 }
@@ -77,6 +78,7 @@ fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
     program.wait_for_line(&["gpiochip0 line 0 has no hardware PWM"]);
     assert_eq!(refusal(client, 1, &[config("pwmchip0/pwm6", 0)]), "Unable to config pwm device");
     program.wait_for_line(&["pwmchip0/pwm6", "a period of 0 ns", "choose another cycle_time"]);
+    drop(program);
     sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 

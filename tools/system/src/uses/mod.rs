@@ -28,7 +28,7 @@ pub use lines::Names;
 /// The user of a PWM channel that a program has exported.
 pub const A_PROGRAM: &str = "a program";
 /// Highest number of uses. A hostile file could name many.
-const USES_MAX: usize = 4_000;
+const USES_MAX: usize = 1_000;
 
 /// A part of the computer.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
