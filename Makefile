@@ -57,7 +57,7 @@ help:
 	@echo 'make test          the tests for each change, with those on real kernel drivers in a virtual machine'
 	@echo 'make test-all      all tests (tests/README.md): the former, make check and what takes long; as root also'
 	@echo '                   the package, and with KLIPPER_DIR=~/klipper a real klippy'
-	@echo 'make test-slow     tests of the program in which heaters and motors take their real time'
+	@echo 'make test-slow     tests in which heaters and motors take their real time, and of drivers that hang'
 	@echo 'make test-kernel   all tests on real kernel drivers, on two kernels'
 	@echo 'make figures       figures of the program in that virtual machine (docs/develop/performance.md)'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
@@ -97,15 +97,17 @@ mainsail: system-packages-mainsail build
 build: system-packages-build
 	@'$(CARGO)' build --release --locked --quiet --package pinion-mcu --package pinion-sim
 
+# The virtual machines are such computers.
+EMULATES = $(filter x86_64,$(shell uname -m))
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
-# The drivers and mocks themselves, and what sends a hundred thousand frames: `make test-kernel` has them.
-DRIVERS = --flavour stock --skip selftest:: --skip can::a_node_that_floods --skip can::a_node_that_takes_and_gives
+# `make test-slow` has what hangs, is stopped or floods a bus, and `make test-kernel` the drivers and mocks themselves.
+DRIVERS = --flavour stock --skip selftest:: --skip slow::
 
 # Most tests of the programs wait, and most of those on drivers compute: both take hardly longer than one of them.
 test: system-packages-vm
 	'$(CARGO)' test --locked --no-run
-ifeq ($(shell uname -m),x86_64)
+ifdef EMULATES
 	'$(CARGO)' test --locked --no-run --test kernel --test kernel_guest
 	@$(MAKE) --no-print-directory -j2 test-programs test-drivers
 else
@@ -130,7 +132,8 @@ test-all: check test test-slow test-kernel figures
 	else echo 'NOT RUN: make test-package, which takes root' >&2; fi
 	@$(MAKE) --no-print-directory klippy
 
-test-slow:
+test-slow: $(if $(EMULATES),system-packages-vm)
+	$(if $(EMULATES),$(TEST_KERNEL) -- --flavour stock slow::)
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::cut::
 	@# In real time, so that it would delay the others.
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::demonstration:: --test-threads=1

@@ -33,8 +33,7 @@ use vm::Run;
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
-/// Highest number of tests in one VM. The start of a VM takes as long as several tests. With more VMs than processors,
-/// no processor is idle while another one has half of its work left.
+/// Highest number of tests in one VM.
 const TESTS_IN_A_VM: usize = 32;
 
 /// Tests with figures that are compared with another run or another program. They have their own VM, so that their
@@ -99,24 +98,26 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
     let mut runs = Vec::new();
     let mut filtered_out = 0;
     for flavour in Flavour::ALL {
-        let mut add = |program, tests: &[String], in_a_vm: usize| {
+        let mut add = |program, tests: &[String], vms: &dyn Fn(usize) -> usize| {
             let print_seconds = options.print_seconds;
             let whole = Run { flavour, program, print_seconds, tests: tests.to_vec() };
             let (selected, left_out): (Vec<_>, Vec<_>) =
                 tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
             filtered_out += left_out.len();
-            let vms = selected.len().div_ceil(in_a_vm);
+            let vms = vms(selected.len());
             // In turn: the tests of one file take about the same time, and may be the longest.
             runs.extend((0..vms).map(|vm| {
                 let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
                 Run { flavour, program, print_seconds, tests }
             }));
         };
-        add(None, &others, TESTS_IN_A_VM);
-        add(None, &numbered, TESTS_IN_A_VM);
+        // No processor is idle while another one has a whole VM left.
+        add(None, &others, &|tests| tests.div_ceil(TESTS_IN_A_VM).next_multiple_of(processors()).min(tests));
+        let one_vm = |tests: usize| tests.min(1);
+        add(None, &numbered, &one_vm);
         for program in [None].into_iter().chain(options.programs.iter().map(Some)) {
-            add(program, &figures, figures.len());
-            add(program, &counted, 1);
+            add(program, &figures, &one_vm);
+            add(program, &counted, &|tests| tests);
         }
     }
     (runs, filtered_out)
@@ -142,12 +143,15 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
     let order: Vec<&Run<'_>> = runs.iter().rev().collect();
     let report = Mutex::new(report);
     // A VM emulates one processor.
-    let vms = thread::available_parallelism().map_or(1, usize::from);
-    at_once(&order, vms, |run| {
+    at_once(&order, processors(), |run| {
         let index = flavours.iter().position(|flavour| *flavour == run.flavour).expect("that of a run");
         run.perform(&snapshots[index], &cache, &report)
     })
     .map(drop)
+}
+
+fn processors() -> usize {
+    thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Applies the function to the items, and returns the results in their order. This many threads each take the next item

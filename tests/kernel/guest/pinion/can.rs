@@ -213,21 +213,6 @@ fn a_node_is_found_assigned_and_asked() {
 }
 
 #[test]
-fn lost_doubled_and_swapped_frames_cost_time_and_nothing_else() {
-    let _interface = Interface::new();
-    let _sim = GpioSim::new("lab", 8);
-    let program = start();
-    let (_host, mut client) = Host::connect(true);
-    configure(&mut client, 1, &["config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0"]);
-    for count in 0..200_u32 {
-        run(&mut client, &format!("update_digital_out oid=0 value={}", count % 2));
-        client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    }
-    client.check().expect("no shutdown");
-    assert!(!program.log().contains("shutdown"), "{}", program.log());
-}
-
-#[test]
 fn a_host_that_begins_anew_gets_the_node_again() {
     let _interface = Interface::new();
     let program = start();
@@ -293,69 +278,6 @@ const HEATER: [&str; 2] = [
 fn heat(client: &mut Client) {
     let at = client.clock_in(0.02).expect("the clock").wire();
     run(client, &format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
-}
-
-#[test]
-fn a_second_host_that_assigns_another_nodeid_leaves_no_heater_on() {
-    let _interface = Interface::new();
-    let sim = GpioSim::new("lab", 8);
-    let program = start();
-    let (host, mut client) = Host::connect(false);
-    configure(&mut client, 1, &HEATER);
-    heat(&mut client);
-    sysfs::wait_until("the heater is on", || sim.level(1));
-    // The node now listens to the second host, and the first one refreshes in vain, each time for 0.2 s later.
-    let first = client.clock_in(0.02).expect("the clock").wire();
-    assign(&bus(), UUID_BYTES, NODE_ID + 1);
-    for round in 1..=10 {
-        let at = first.wrapping_add(round * 10_000_000);
-        let _ = client.send_line(&format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
-        thread::sleep(Duration::from_millis(200));
-    }
-    assert!(!sim.level(1));
-    let log = program.log();
-    assert!(log.contains("Missed scheduling of next digital out event"), "{log}");
-    drop((host, client));
-    // The first one assigns its own again, and hears why.
-    let (_host, mut client) = Host::connect(false);
-    assert!(client.status().expect("an answer").is_shutdown);
-}
-
-#[test]
-fn a_heater_stays_on_beside_nodes_that_fill_the_bus_and_errors_of_its_interface() {
-    let _interface = Interface::new();
-    let sim = GpioSim::new("lab", 8);
-    let program = start();
-    let (_host, mut client) = Host::connect(false);
-    configure(&mut client, 1, &HEATER);
-    heat(&mut client);
-    sysfs::wait_until("the heater is on", || sim.level(1));
-    // As many frames as a bus of 1 Mbit/s carries.
-    let flood = Flood::start(|bus, round| {
-        for count in 0..64 {
-            let id = HOST_ID + 2 + (round.wrapping_mul(64) + count) as u16 % 0xf0;
-            throw_data(bus, id, &[0x7e; 8]);
-        }
-        throw_data(bus, ADMIN, &[1, 9, 9, 9, 9, 9, 9, NODE_ID + 1]);
-        // Off the bus, and back.
-        for bits in [libc::CAN_ERR_BUSOFF, libc::CAN_ERR_RESTARTED] {
-            throw(bus, CanErrorFrame::new_error(bits, &[0; 8]).expect("eight bytes"));
-        }
-        thread::sleep(Duration::from_millis(8));
-    });
-    for _ in 0..10 {
-        thread::sleep(Duration::from_millis(200));
-        heat(&mut client);
-    }
-    client.check().expect("no shutdown");
-    sysfs::wait_until("the heater is on", || sim.level(1));
-    let rounds = flood.end();
-    assert!(rounds > 100, "{rounds} rounds are no flood");
-    let status = client.query("get_canbus_status", &[], "canbus_status", None).expect("an answer");
-    assert_eq!(status.text("canbus_bus_state").expect("a name"), "active");
-    let log = program.log();
-    assert!(log.contains("is off the bus after too many errors"), "{log}");
-    assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
 }
 
 #[test]
@@ -502,48 +424,131 @@ fn is_served(program: &mut Program, sim: &GpioSim) {
     assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
 }
 
-#[test]
-fn a_node_that_floods_the_bus_keeps_no_output_on_and_no_later_host_away() {
-    let _interface = Interface::new();
-    // Without this the interface takes no FD frames.
-    ip(&format!("link set {INTERFACE} mtu 72"));
-    let sim = GpioSim::new("lab", 8);
-    let mut program = start();
-    let (host, mut client) = Host::connect(false);
-    let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=100000000";
-    configure(&mut client, 1, &[heater]);
-    run(&mut client, "update_digital_out oid=0 value=1");
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    assert!(sim.level(1));
-    let before_kb = memory_kb(&program);
-    let flood = Flood::start(all_kinds);
-    // The host is drowned.
-    drop(host);
-    program.wait_for_line(&["Missed scheduling of next digital out event"]);
-    assert!(!sim.level(1));
-    let rounds = flood.end();
-    assert!(rounds > 100, "{rounds} rounds are no flood");
-    assert!(memory_kb(&program) < before_kb + 8192, "from {before_kb} to {} kB", memory_kb(&program));
-    is_served(&mut program, &sim);
-}
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
 
-#[test]
-fn a_node_that_takes_and_gives_ids_stops_the_mcu_and_keeps_no_later_host_away() {
-    let _interface = Interface::new();
-    let sim = GpioSim::new("lab", 8);
-    let mut program = start();
-    let (host, mut client) = Host::connect(false);
-    let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0";
-    configure(&mut client, 1, &[heater]);
-    run(&mut client, "update_digital_out oid=0 value=1");
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    assert!(sim.level(1));
-    let flood = Flood::start(all_ids);
-    drop(host);
-    program.wait_for_line(&["Another CAN node assigned this ID"]);
-    sysfs::wait_until("the output is off", || !sim.level(1));
-    thread::sleep(Duration::from_secs(2));
-    let rounds = flood.end();
-    assert!(rounds > 100, "{rounds} rounds are no flood");
-    is_served(&mut program, &sim);
+    #[test]
+    fn lost_doubled_and_swapped_frames_cost_time_and_nothing_else() {
+        let _interface = Interface::new();
+        let _sim = GpioSim::new("lab", 8);
+        let program = start();
+        let (_host, mut client) = Host::connect(true);
+        configure(&mut client, 1, &["config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0"]);
+        for count in 0..200_u32 {
+            run(&mut client, &format!("update_digital_out oid=0 value={}", count % 2));
+            client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        }
+        client.check().expect("no shutdown");
+        assert!(!program.log().contains("shutdown"), "{}", program.log());
+    }
+
+    #[test]
+    fn a_second_host_that_assigns_another_nodeid_leaves_no_heater_on() {
+        let _interface = Interface::new();
+        let sim = GpioSim::new("lab", 8);
+        let program = start();
+        let (host, mut client) = Host::connect(false);
+        configure(&mut client, 1, &HEATER);
+        heat(&mut client);
+        sysfs::wait_until("the heater is on", || sim.level(1));
+        // The node now listens to the second host, and the first one refreshes in vain, each time for 0.2 s later.
+        let first = client.clock_in(0.02).expect("the clock").wire();
+        assign(&bus(), UUID_BYTES, NODE_ID + 1);
+        for round in 1..=10 {
+            let at = first.wrapping_add(round * 10_000_000);
+            let _ = client.send_line(&format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
+            thread::sleep(Duration::from_millis(200));
+        }
+        assert!(!sim.level(1));
+        let log = program.log();
+        assert!(log.contains("Missed scheduling of next digital out event"), "{log}");
+        drop((host, client));
+        // The first one assigns its own again, and hears why.
+        let (_host, mut client) = Host::connect(false);
+        assert!(client.status().expect("an answer").is_shutdown);
+    }
+
+    #[test]
+    fn a_heater_stays_on_beside_nodes_that_fill_the_bus_and_errors_of_its_interface() {
+        let _interface = Interface::new();
+        let sim = GpioSim::new("lab", 8);
+        let program = start();
+        let (_host, mut client) = Host::connect(false);
+        configure(&mut client, 1, &HEATER);
+        heat(&mut client);
+        sysfs::wait_until("the heater is on", || sim.level(1));
+        // As many frames as a bus of 1 Mbit/s carries.
+        let flood = Flood::start(|bus, round| {
+            for count in 0..64 {
+                let id = HOST_ID + 2 + (round.wrapping_mul(64) + count) as u16 % 0xf0;
+                throw_data(bus, id, &[0x7e; 8]);
+            }
+            throw_data(bus, ADMIN, &[1, 9, 9, 9, 9, 9, 9, NODE_ID + 1]);
+            // Off the bus, and back.
+            for bits in [libc::CAN_ERR_BUSOFF, libc::CAN_ERR_RESTARTED] {
+                throw(bus, CanErrorFrame::new_error(bits, &[0; 8]).expect("eight bytes"));
+            }
+            thread::sleep(Duration::from_millis(8));
+        });
+        for _ in 0..10 {
+            thread::sleep(Duration::from_millis(200));
+            heat(&mut client);
+        }
+        client.check().expect("no shutdown");
+        sysfs::wait_until("the heater is on", || sim.level(1));
+        let rounds = flood.end();
+        assert!(rounds > 100, "{rounds} rounds are no flood");
+        let status = client.query("get_canbus_status", &[], "canbus_status", None).expect("an answer");
+        assert_eq!(status.text("canbus_bus_state").expect("a name"), "active");
+        let log = program.log();
+        assert!(log.contains("is off the bus after too many errors"), "{log}");
+        assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
+    }
+
+    #[test]
+    fn a_node_that_floods_the_bus_keeps_no_output_on_and_no_later_host_away() {
+        let _interface = Interface::new();
+        // Without this the interface takes no FD frames.
+        ip(&format!("link set {INTERFACE} mtu 72"));
+        let sim = GpioSim::new("lab", 8);
+        let mut program = start();
+        let (host, mut client) = Host::connect(false);
+        let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=100000000";
+        configure(&mut client, 1, &[heater]);
+        run(&mut client, "update_digital_out oid=0 value=1");
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        assert!(sim.level(1));
+        let before_kb = memory_kb(&program);
+        let flood = Flood::start(all_kinds);
+        // The host is drowned.
+        drop(host);
+        program.wait_for_line(&["Missed scheduling of next digital out event"]);
+        assert!(!sim.level(1));
+        let rounds = flood.end();
+        assert!(rounds > 100, "{rounds} rounds are no flood");
+        assert!(memory_kb(&program) < before_kb + 8192, "from {before_kb} to {} kB", memory_kb(&program));
+        is_served(&mut program, &sim);
+    }
+
+    #[test]
+    fn a_node_that_takes_and_gives_ids_stops_the_mcu_and_keeps_no_later_host_away() {
+        let _interface = Interface::new();
+        let sim = GpioSim::new("lab", 8);
+        let mut program = start();
+        let (host, mut client) = Host::connect(false);
+        let heater = "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=0";
+        configure(&mut client, 1, &[heater]);
+        run(&mut client, "update_digital_out oid=0 value=1");
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        assert!(sim.level(1));
+        let flood = Flood::start(all_ids);
+        drop(host);
+        program.wait_for_line(&["Another CAN node assigned this ID"]);
+        sysfs::wait_until("the output is off", || !sim.level(1));
+        thread::sleep(Duration::from_secs(2));
+        let rounds = flood.end();
+        assert!(rounds > 100, "{rounds} rounds are no flood");
+        is_served(&mut program, &sim);
+    }
 }

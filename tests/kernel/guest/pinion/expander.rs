@@ -262,34 +262,6 @@ fn an_axis_homes_to_an_endstop_on_it() {
 }
 
 #[test]
-fn an_emergency_stop_waits_for_no_chip_that_hangs() {
-    let (mut setup, mut client) = Setup::on();
-    let trace = Trace::start();
-    let guardian = setup.program.guardian();
-    let hangs = setup.expander.slow_down(HANGS_MS);
-    let began_us = now_us();
-    client.send_line("emergency_stop").expect("a session");
-    setup.assert_heater_off(&trace, began_us, 50_000);
-    // Only the fan's shutdown value is missing, and the guardian handles it.
-    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
-    // One second for a shutdown value, two for the program's end, two for the chip.
-    let acted_us = now_us() - began_us;
-    println!("killed, and the chip given up, after {acted_us} us");
-    assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
-    setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
-    assert!(!exists(setup.program.pid()), "it is killed while the chip still hangs");
-    sysfs::wait_until("the guardian ends", || !exists(guardian));
-    assert!(now_us() - began_us < 1000 * HANGS_MS);
-    drop(hangs);
-    assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
-    // The write that hung completes in the end.
-    setup.expander.wait_until_free();
-    assert!(!setup.expander.level(3));
-    drop(trace);
-    setup.assert_starts_anew();
-}
-
-#[test]
 fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
     let (mut setup, mut client) = Setup::on();
     let trace = Trace::start();
@@ -332,41 +304,6 @@ fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
     assert!(!program.log().contains("guardian"), "{}", program.log());
     client.reset().expect("a reset");
     setup.switch_on(&mut client);
-}
-
-#[test]
-fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
-    let (mut setup, mut client) = Setup::on();
-    let silent = setup.expander.fall_silent();
-    let began_us = now_us();
-    client.send_line("update_digital_out oid=1 value=0").expect("a session");
-    assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
-    let killed_us = now_us() - began_us;
-    println!("killed after {killed_us} us");
-    assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
-    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
-    setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
-    drop(silent);
-    setup.assert_starts_anew();
-}
-
-#[test]
-fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
-    let (mut setup, _) = Setup::on();
-    let guardian = setup.program.guardian();
-    let silent = setup.expander.fall_silent();
-    let trace = Trace::start();
-    let began_us = now_us();
-    setup.program.signal(Signal::SIGTERM);
-    setup.assert_heater_off(&trace, began_us, 50_000);
-    assert!(!setup.program.wait().success());
-    // The chip is back while the guardian retries.
-    drop(silent);
-    sysfs::wait_until("the guardian ends", || !exists(guardian));
-    setup.program.wait_for_line(&["guardian: ", &setup.fan(), "all 2 outputs are driven to their shutdown values"]);
-    assert!(!setup.expander.level(3));
-    drop(trace);
-    setup.assert_starts_anew();
 }
 
 #[test]
@@ -439,30 +376,6 @@ fn missed(program: &Program) -> (u64, u64) {
     (sum("errors"), sum("retries"))
 }
 
-#[test]
-fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
-    let (expander, program, mut client) = with_inputs();
-    let client = &mut client;
-    for count in 1..=10 {
-        expander.miss_one();
-        sysfs::wait_until("the transfer is tried again", || missed(&program) == (count, count));
-    }
-    for level in [false, true] {
-        expander.miss_one();
-        run(client, &format!("set_digital_out pin={} value={}", expander.pin(3), u8::from(level)));
-        assert_eq!(expander.level(3), level);
-    }
-    expander.miss_one();
-    client.drain();
-    run(client, "endstop_query_state oid=1");
-    expander.set_inputs(1);
-    let until = Instant::now() + Duration::from_secs(5);
-    let state = client.wait("buttons_state", Some(0), until).expect("a session").expect("a state");
-    assert_eq!(state.bytes("state").expect("a state"), [1]);
-    assert!(!client.status().expect("a session").is_shutdown, "{}", program.log());
-    assert_eq!(missed(&program), (13, 13));
-}
-
 /// The chip falls silent, and the MCU stops after a time in this range, in microseconds.
 fn stops_silent(expander: &Expander, client: &mut Client, after_us: Range<u64>) -> sysfs::Setting {
     let silent = expander.fall_silent();
@@ -508,19 +421,111 @@ fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
     program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
 }
 
-#[test]
-fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
-    let (expander, program, mut client) = with_inputs();
-    let client = &mut client;
-    let hangs = expander.slow_down(HANGS_MS);
-    thread::sleep(Duration::from_millis(50));
-    client.reset().expect("a reset");
-    drop(hangs);
-    program.wait_for_line(&[&expander.chip_name, "does not answer"]);
-    assert!(expander.is_held(), "the chip still hangs");
-    expander.wait_until_free();
-    assert!(!expander.is_held());
-    configure_inputs(client, &expander);
-    thread::sleep(Duration::from_millis(200));
-    assert!(!client.status().expect("a session").is_shutdown);
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn an_emergency_stop_waits_for_no_chip_that_hangs() {
+        let (mut setup, mut client) = Setup::on();
+        let trace = Trace::start();
+        let guardian = setup.program.guardian();
+        let hangs = setup.expander.slow_down(HANGS_MS);
+        let began_us = now_us();
+        client.send_line("emergency_stop").expect("a session");
+        setup.assert_heater_off(&trace, began_us, 50_000);
+        // Only the fan's shutdown value is missing, and the guardian handles it.
+        setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
+        // One second for a shutdown value, two for the program's end, two for the chip.
+        let acted_us = now_us() - began_us;
+        println!("killed, and the chip given up, after {acted_us} us");
+        assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
+        setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
+        assert!(!exists(setup.program.pid()), "it is killed while the chip still hangs");
+        sysfs::wait_until("the guardian ends", || !exists(guardian));
+        assert!(now_us() - began_us < 1000 * HANGS_MS);
+        drop(hangs);
+        assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
+        // The write that hung completes in the end.
+        setup.expander.wait_until_free();
+        assert!(!setup.expander.level(3));
+        drop(trace);
+        setup.assert_starts_anew();
+    }
+
+    #[test]
+    fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
+        let (mut setup, mut client) = Setup::on();
+        let silent = setup.expander.fall_silent();
+        let began_us = now_us();
+        client.send_line("update_digital_out oid=1 value=0").expect("a session");
+        assert_eq!(setup.program.wait().signal(), Some(Signal::SIGKILL as i32));
+        let killed_us = now_us() - began_us;
+        println!("killed after {killed_us} us");
+        assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
+        setup.program.wait_for_line(&["guardian: ", &setup.fan(), "is not at its shutdown value within 1000 ms"]);
+        setup.program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
+        drop(silent);
+        setup.assert_starts_anew();
+    }
+
+    #[test]
+    fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
+        let (mut setup, _) = Setup::on();
+        let guardian = setup.program.guardian();
+        let silent = setup.expander.fall_silent();
+        let trace = Trace::start();
+        let began_us = now_us();
+        setup.program.signal(Signal::SIGTERM);
+        setup.assert_heater_off(&trace, began_us, 50_000);
+        assert!(!setup.program.wait().success());
+        // The chip is back while the guardian retries.
+        drop(silent);
+        sysfs::wait_until("the guardian ends", || !exists(guardian));
+        setup.program.wait_for_line(&["guardian: ", &setup.fan(), "all 2 outputs are driven to their shutdown values"]);
+        assert!(!setup.expander.level(3));
+        drop(trace);
+        setup.assert_starts_anew();
+    }
+
+    #[test]
+    fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
+        let (expander, program, mut client) = with_inputs();
+        let client = &mut client;
+        for count in 1..=10 {
+            expander.miss_one();
+            sysfs::wait_until("the transfer is tried again", || missed(&program) == (count, count));
+        }
+        for level in [false, true] {
+            expander.miss_one();
+            run(client, &format!("set_digital_out pin={} value={}", expander.pin(3), u8::from(level)));
+            assert_eq!(expander.level(3), level);
+        }
+        expander.miss_one();
+        client.drain();
+        run(client, "endstop_query_state oid=1");
+        expander.set_inputs(1);
+        let until = Instant::now() + Duration::from_secs(5);
+        let state = client.wait("buttons_state", Some(0), until).expect("a session").expect("a state");
+        assert_eq!(state.bytes("state").expect("a state"), [1]);
+        assert!(!client.status().expect("a session").is_shutdown, "{}", program.log());
+        assert_eq!(missed(&program), (13, 13));
+    }
+
+    #[test]
+    fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
+        let (expander, program, mut client) = with_inputs();
+        let client = &mut client;
+        let hangs = expander.slow_down(HANGS_MS);
+        thread::sleep(Duration::from_millis(50));
+        client.reset().expect("a reset");
+        drop(hangs);
+        program.wait_for_line(&[&expander.chip_name, "does not answer"]);
+        assert!(expander.is_held(), "the chip still hangs");
+        expander.wait_until_free();
+        assert!(!expander.is_held());
+        configure_inputs(client, &expander);
+        thread::sleep(Duration::from_millis(200));
+        assert!(!client.status().expect("a session").is_shutdown);
+    }
 }

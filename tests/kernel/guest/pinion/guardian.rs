@@ -97,14 +97,6 @@ fn a_killed_program_s_other_lines_go_to_their_shutdown_values() {
     program.wait_for_line(&["guardian: ", "all 6 outputs are driven to their shutdown values"]);
 }
 
-#[test]
-fn a_core_that_hangs_is_noticed() {
-    let outputs = Outputs::new();
-    let log = end_by(&outputs, Signal::SIGUSR2);
-    assert!(log.contains("outputs are driven to their shutdown values"), "{log}");
-    assert_starts_anew(&outputs);
-}
-
 /// A program started now gets the lines.
 fn assert_starts_anew(outputs: &Outputs) {
     let program = Program::start();
@@ -135,23 +127,11 @@ fn lose_guardian_by(signal: Signal, words: &str) -> u64 {
 }
 
 #[test]
-fn a_program_without_its_guardian_stops_and_says_so() {
-    lose_guardian_by(Signal::SIGKILL, "somebody killed the guardian");
-}
-
-#[test]
 fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
     let outputs = Outputs::new();
     let log = end_by(&outputs, Signal::SIGSTOP);
     assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
     assert_starts_anew(&outputs);
-}
-
-#[test]
-fn a_guardian_that_is_stopped_counts_as_lost() {
-    // Its last check was at most 550 ms before.
-    let after_ms = lose_guardian_by(Signal::SIGSTOP, "no heartbeat: was it stopped?");
-    assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
 }
 
 /// A line that is on, without a limit (`max_duration`). Nothing else would notice lost time.
@@ -190,28 +170,6 @@ impl Heater {
         program.signal(Signal::SIGTERM);
         assert!(program.wait().success());
         assert!(!program.log().replace(&verdict, "").contains("guardian"), "{}", program.log());
-    }
-}
-
-#[test]
-fn an_mcu_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
-    let heater = Heater::new();
-    for guardian_first in [true, false] {
-        let program = Program::start();
-        let client = heater.switch_on(&program);
-        let mut both = [program.guardian(), program.pid()];
-        for process in both {
-            kill(process, Signal::SIGSTOP).expect("a process");
-        }
-        thread::sleep(Duration::from_secs(20));
-        assert!(heater.is_on(), "nobody is left who could switch it off");
-        if !guardian_first {
-            both.reverse();
-        }
-        for process in both {
-            kill(process, Signal::SIGCONT).expect("a process");
-        }
-        heater.assert_stopped_in_order(program, client);
     }
 }
 
@@ -255,23 +213,70 @@ impl Drop for ControlGroup {
     }
 }
 
-#[test]
-fn an_mcu_whose_control_group_was_frozen_stops_when_it_is_thawed() {
-    let heater = Heater::new();
-    let program = Program::start();
-    let group = ControlGroup::new();
-    group.add(program.pid());
-    group.add(program.guardian());
-    let client = heater.switch_on(&program);
-    // A freeze that is too short to be noticed.
-    group.freeze(true);
-    thread::sleep(Duration::from_millis(300));
-    group.freeze(false);
-    thread::sleep(Duration::from_secs(5));
-    assert!(heater.is_on(), "{}", program.log());
-    group.freeze(true);
-    thread::sleep(Duration::from_secs(20));
-    assert!(heater.is_on());
-    group.freeze(false);
-    heater.assert_stopped_in_order(program, client);
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_core_that_hangs_is_noticed() {
+        let outputs = Outputs::new();
+        let log = end_by(&outputs, Signal::SIGUSR2);
+        assert!(log.contains("outputs are driven to their shutdown values"), "{log}");
+        assert_starts_anew(&outputs);
+    }
+
+    #[test]
+    fn a_program_without_its_guardian_stops_and_says_so() {
+        lose_guardian_by(Signal::SIGKILL, "somebody killed the guardian");
+    }
+
+    #[test]
+    fn a_guardian_that_is_stopped_counts_as_lost() {
+        // Its last check was at most 550 ms before.
+        let after_ms = lose_guardian_by(Signal::SIGSTOP, "no heartbeat: was it stopped?");
+        assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
+    }
+
+    #[test]
+    fn an_mcu_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
+        let heater = Heater::new();
+        for guardian_first in [true, false] {
+            let program = Program::start();
+            let client = heater.switch_on(&program);
+            let mut both = [program.guardian(), program.pid()];
+            for process in both {
+                kill(process, Signal::SIGSTOP).expect("a process");
+            }
+            thread::sleep(Duration::from_secs(20));
+            assert!(heater.is_on(), "nobody is left who could switch it off");
+            if !guardian_first {
+                both.reverse();
+            }
+            for process in both {
+                kill(process, Signal::SIGCONT).expect("a process");
+            }
+            heater.assert_stopped_in_order(program, client);
+        }
+    }
+
+    #[test]
+    fn an_mcu_whose_control_group_was_frozen_stops_when_it_is_thawed() {
+        let heater = Heater::new();
+        let program = Program::start();
+        let group = ControlGroup::new();
+        group.add(program.pid());
+        group.add(program.guardian());
+        let client = heater.switch_on(&program);
+        // A freeze that is too short to be noticed.
+        group.freeze(true);
+        thread::sleep(Duration::from_millis(300));
+        group.freeze(false);
+        thread::sleep(Duration::from_secs(5));
+        assert!(heater.is_on(), "{}", program.log());
+        group.freeze(true);
+        thread::sleep(Duration::from_secs(20));
+        assert!(heater.is_on());
+        group.freeze(false);
+        heater.assert_stopped_in_order(program, client);
+    }
 }

@@ -120,25 +120,6 @@ fn a_channel_that_fails_stops_the_mcu_and_is_tried_again() {
 }
 
 #[test]
-fn a_channel_that_goes_on_failing_is_left_to_the_guardian() {
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    switch_on(client);
-    let guardian = program.guardian();
-    let failing = fail();
-    client.send_line("emergency_stop").expect("a session");
-    assert_eq!(shutdown_of(client), "Command request");
-    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
-    program.wait_for_line(&["guardian: ", "still not at its shutdown value: pwmchip0/pwm6: Input/output error"]);
-    drop(failing);
-    sysfs::wait_until("the guardian ends", || !exists(guardian));
-    program.wait_for_line(&["is not at its shutdown value within 1000 ms", "all 1 outputs are driven"]);
-    assert_eq!(pwm::output(6), OFF);
-    switch_on(&mut Program::start().connect());
-    sysfs::write(format!("{CHIP}/unexport"), "6");
-}
-
-#[test]
 fn a_channel_that_is_set_anew_is_left_at_its_last_value_by_the_guardian() {
     let mut program = Program::start();
     let client = &mut program.connect();
@@ -152,4 +133,28 @@ fn a_channel_that_is_set_anew_is_left_at_its_last_value_by_the_guardian() {
     program.wait_for_line(&["guardian: ", "all 1 outputs are driven"]);
     assert_eq!(pwm::output(6), "6 2000000 1000000 1");
     sysfs::write(format!("{CHIP}/unexport"), "6");
+}
+
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_channel_that_goes_on_failing_is_left_to_the_guardian() {
+        let mut program = Program::start();
+        let client = &mut program.connect();
+        switch_on(client);
+        let guardian = program.guardian();
+        let failing = fail();
+        client.send_line("emergency_stop").expect("a session");
+        assert_eq!(shutdown_of(client), "Command request");
+        assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+        program.wait_for_line(&["guardian: ", "still not at its shutdown value: pwmchip0/pwm6: Input/output error"]);
+        drop(failing);
+        sysfs::wait_until("the guardian ends", || !exists(guardian));
+        program.wait_for_line(&["is not at its shutdown value within 1000 ms", "all 1 outputs are driven"]);
+        assert_eq!(pwm::output(6), OFF);
+        switch_on(&mut Program::start().connect());
+        sysfs::write(format!("{CHIP}/unexport"), "6");
+    }
 }
