@@ -138,9 +138,7 @@ fn examine(computer: &Computer, board: Option<&Board>, measures: bool) -> Vec<Gr
         let pins = host::of_all(&klippys, Printer::numbered);
         let pins = lines::of_instances(&instances, &pins);
         groups.insert(7, Group::new("lines", lines::header(computer, inventory, &pins)));
-        if measures {
-            groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
-        }
+        groups.extend(measures.then(|| Group::new("latency", vec![latency(latency::sample(is_serving))])));
     }
     groups
 }
