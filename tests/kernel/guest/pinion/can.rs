@@ -505,6 +505,11 @@ mod slow {
         assert!(log.contains("is off the bus after too many errors"), "{log}");
         assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
     }
+}
+
+/// A hundred thousand frames each: `make test-kernel` has them.
+mod floods {
+    use super::*;
 
     #[test]
     fn a_node_that_floods_the_bus_keeps_no_output_on_and_no_later_host_away() {
