@@ -195,10 +195,7 @@ impl Target {
             let Some((key, value)) = line.split_once(": ") else { continue };
             let role = value.rsplit_once('{').and_then(|(_, rest)| rest.strip_suffix('}'));
             if let (Some(role), Some(section)) = (role, section)
-                && let Some(pin) = self
-                    .printer
-                    .pins_of(section)
-                    .find(|named| section.text(key).is_some_and(|text| text.trim() == named.text))
+                && let Some(pin) = self.printer.pins_of(section).find(|named| named.setting.key == key)
             {
                 found.insert(role.to_owned(), pin.pin.name);
             }

@@ -539,14 +539,14 @@ fn a_device_that_goes_takes_nothing_from_the_others() {
         let (spi, i2c) = (overlay("spidev1_1"), overlay("i2c3-ph"));
         Card::of("OrangePi Zero3", &[("boot/armbianEnv.txt", env), (&*spi, ""), (&*i2c, "")])
     };
-    let cards: [(&str, [&[&str]; 3]); 4] = [
+    let kinds: [(&str, [&[&str]; 3]); 4] = [
         ("", [&["adxl345"], &["lis2dw"], &["bme280"]]),
         // The second one needs a faster bus than the first one.
         ("", [&["bme280"], &["lis2dw", "--bus", "i2c"], &["ssd1306"]]),
         (&armbian, [&["adxl345"], &["bme280"], &["sht"]]),
         (&with_overlays, [&["sht"], &["adxl345"], &["bme280"]]),
     ];
-    for (env, devices) in cards {
+    for (env, devices) in kinds {
         let card = card_with(env);
         card.put("etc/modules-load.d/cups-filters.conf", "lp\n");
         let before = card.snapshot();

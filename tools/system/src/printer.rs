@@ -8,7 +8,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use pinion_printer_config::pins::{Aliases, Pin, section_of};
-use pinion_printer_config::{Config, Section, Trouble};
+use pinion_printer_config::{Config, Section, Setting, Trouble};
 use pinion_runtime::klippy::HOST_PATHS;
 
 use super::Computer;
@@ -31,6 +31,8 @@ pub struct Printer {
 pub struct Named<'a> {
     /// The section with the option.
     pub section: &'a Section,
+    /// The option.
+    pub setting: &'a Setting,
     /// The text, as it is written.
     pub text: &'a str,
     /// The MCU, and the name without marks and aliases.
@@ -77,10 +79,12 @@ impl Printer {
             !["board_pins", "duplicate_pin_override", "gcode_macro", "delayed_gcode"].contains(&section.kind());
         let is_pin = |key: &str| ["pin", "pins"].contains(&key) || key.ends_with("_pin") || key.ends_with("_pins");
         let options = section.settings().iter().filter(move |setting| has_pins && is_pin(&setting.key));
-        options.flat_map(|setting| setting.value.split(',')).filter_map(move |text| {
-            let pin = self.aliases.resolve(&Pin::parse(text, true, true).ok()?);
-            Some(Named { section, text: text.trim(), pin })
-        })
+        options.flat_map(|setting| setting.value.split(',').map(move |text| (setting, text))).filter_map(
+            move |(setting, text)| {
+                let pin = self.aliases.resolve(&Pin::parse(text, true, true).ok()?);
+                Some(Named { section, setting, text: text.trim(), pin })
+            },
+        )
     }
 
     /// The MCU of a section: that of its pins, or its `i2c_mcu`.

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use indexmap::IndexSet;
 use pinion_linux::Inventory;
 use pinion_linux::sysfs::Sysfs;
 use pinion_printer_config::Section;
@@ -28,10 +29,10 @@ pub use lines::Names;
 /// The user of a PWM channel that a program has exported.
 pub const A_PROGRAM: &str = "a program";
 /// Highest number of uses. A hostile file could name many.
-const USES_MAX: usize = 1_000;
+const USES_MAX: usize = 4_000;
 
 /// A part of the computer.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Resource {
     /// A GPIO line, by its one name.
     Line(String),
@@ -83,7 +84,7 @@ impl std::fmt::Display for Resource {
 }
 
 /// The evidence that something is used.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Source {
     /// The kernel: a driver, or a consumer of a line.
     Kernel,
@@ -96,7 +97,7 @@ pub enum Source {
 }
 
 /// A use of a part.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Use {
     /// The part.
     pub what: Resource,
@@ -129,8 +130,8 @@ pub struct Uses {
     pub names: Names,
     /// The board, if it is known.
     pub board: Option<Board>,
-    /// The uses, in the order in which they were found.
-    pub all: Vec<Use>,
+    /// The uses, each once, in the order in which they were found.
+    pub all: IndexSet<Use>,
     /// The config.txt, if the board has one.
     pub config_txt: boot::ConfigTxt,
     /// The pins that are no lines.
@@ -152,7 +153,7 @@ impl Uses {
         let mut uses = Uses {
             names,
             board: board.cloned(),
-            all: Vec::new(),
+            all: IndexSet::new(),
             config_txt: boot::ConfigTxt::read(computer, board),
             no_lines: Vec::new(),
             printers: BTreeMap::new(),
@@ -186,8 +187,8 @@ impl Uses {
     }
 
     fn add(&mut self, one: Use) {
-        if self.all.len() < USES_MAX && !self.all.contains(&one) {
-            self.all.push(one);
+        if self.all.len() < USES_MAX {
+            self.all.insert(one);
         }
     }
 
@@ -203,8 +204,7 @@ impl Uses {
             let is_alone = ["neopixel", "dotstar", "load_cell", "load_cell_probe"].contains(&section.kind());
             for named in &pins {
                 let name = named.pin.name.as_str();
-                let key = section.settings().iter().find(|setting| setting.value.contains(named.text));
-                let at = key.map_or_else(|| place(""), |setting| setting.place.to_string());
+                let at = named.setting.place.to_string();
                 let what = match spi_node(name.split('/').next().unwrap_or_default()) {
                     Some((bus, _)) if is_alone => Resource::Controller(bus),
                     Some((bus, select)) => Resource::Select(bus, select),

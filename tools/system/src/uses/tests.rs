@@ -163,6 +163,11 @@ fn sections_of_this_computer_s_mcus_with_aliases() {
         printed("[board_pins x]\nmcu: host\naliases: RELAY=GPIO22\n[output_pin a]\npin: host:RELAY\n"),
         [format!("GPIO22 by [output_pin a] at {place}:11")]
     );
+    assert_eq!(
+        printed("[stepper_x]\nenable_pin: !host:gpio17\nstep_pin: host:gpio1\n"),
+        [format!("GPIO1 by [stepper_x] at {place}:9"), format!("GPIO17 by [stepper_x] at {place}:8")],
+        "gpio17 has gpio1 in it"
+    );
     // Other computers' MCUs, and boards.
     assert!(
         printed("[output_pin a]\npin: bed:GPIO17\n[output_pin b]\npin: gpio17\n[mcu x]\nserial: /dev/ttyS0\n")
