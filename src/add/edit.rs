@@ -164,7 +164,11 @@ impl<'a> Editor<'a> {
                     found => found?,
                 };
                 let (fresh, _) = files::beside(&folder.at(""), name.as_ref(), None)?;
-                fs::remove_file(folder.at(fresh))
+                match fs::remove_file(folder.at(fresh)) {
+                    // Another call that makes its changes has swept it away.
+                    Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+                    removed => removed,
+                }
             };
             probed().map_err(|error| failed(&file, &error))?;
         }
@@ -188,8 +192,17 @@ impl<'a> Editor<'a> {
         fs::remove_file(folder.at(name))
     }
 
-    /// Removes the new file that a killed program has left beside a file.
+    /// Removes the new file that a killed program has left beside a file. While another call makes its changes, the new file
+    /// may be that call's, and stays.
     pub(super) fn sweep(&self, file: &Path) {
+        if let Some(folder) = file.parent()
+            && let Ok(_lock) = self.lock(folder, false)
+        {
+            self.sweep_locked(file);
+        }
+    }
+
+    fn sweep_locked(&self, file: &Path) {
         if let Ok(_rights) = self.rights()
             && let Ok((folder, name)) = self.folder(file, false)
         {
@@ -216,7 +229,7 @@ impl<'a> Editor<'a> {
     pub(super) fn make(&self, edits: &[Edit]) -> Result<Vec<String>, String> {
         edits.iter().try_for_each(|edit| self.refuse_read_only(&edit.file))?;
         let _locks = self.locked(edits)?;
-        edits.iter().for_each(|edit| self.sweep(&edit.file));
+        edits.iter().for_each(|edit| self.sweep_locked(&edit.file));
         let mut told = Vec::new();
         let mut done: Vec<String> = Vec::new();
         for edit in edits {
@@ -284,19 +297,18 @@ impl<'a> Editor<'a> {
     /// Locks of all folders with changes.
     fn locked(&self, edits: &[Edit]) -> Result<Vec<Flock<File>>, String> {
         let folders: BTreeSet<&Path> = edits.iter().filter_map(|edit| edit.file.parent()).collect();
-        let mut locks = Vec::new();
-        for folder in folders {
-            let open = || {
-                let _rights = self.rights()?;
-                let (inside, _) = self.folder(&folder.join("x"), true)?;
-                File::open(inside.at("."))
-            };
-            let file = open().map_err(|error| failed(folder, &error))?;
-            let lock = Flock::lock(file, FlockArg::LockExclusiveNonblock);
-            let busy = |_| format!("another pinion add changes files in {}: run this command again", folder.display());
-            locks.push(lock.map_err(busy)?);
-        }
-        Ok(locks)
+        folders.into_iter().map(|folder| self.lock(folder, true)).collect()
+    }
+
+    fn lock(&self, folder: &Path, makes: bool) -> Result<Flock<File>, String> {
+        let open = || {
+            let _rights = self.rights()?;
+            let (inside, _) = self.folder(&folder.join("x"), makes)?;
+            File::open(inside.at("."))
+        };
+        let file = open().map_err(|error| failed(folder, &error))?;
+        let lock = Flock::lock(file, FlockArg::LockExclusiveNonblock);
+        lock.map_err(|_| format!("another pinion add changes files in {}: run this command again", folder.display()))
     }
 }
 

@@ -705,6 +705,18 @@ fn a_kill_leaves_each_file_old_or_new() {
     }
 }
 
+/// Before each change of a call, another one looks for what killed programs have left, and takes nothing of the first one.
+#[test]
+fn a_call_takes_no_new_file_of_another_one_away() {
+    let card = Card::pi();
+    let new = card.copy();
+    new.added(&["adxl345", "--yes"]);
+    before_each_change(&card.arguments(&["adxl345", "--yes"]), || {
+        card.added(&["bme280", "--undo", "--dry-run"]);
+    });
+    assert_eq!(card.snapshot(), new.snapshot());
+}
+
 /// A Moonraker whose host does this. It answers until it is dropped, and returns the requests.
 pub(crate) fn moonraker(state: &'static str) -> (String, thread::JoinHandle<Vec<String>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
