@@ -162,11 +162,11 @@ mod tests {
             let mut left = *run;
             while left > 0 {
                 let slice = left.min(5_000);
-                let fifo: &mut Vec<_> = &mut fifo[cpu];
-                match fifo.last_mut() {
-                    _ if class == Class::Other => {}
-                    Some((_, end)) if *end == now => *end += slice,
-                    _ => fifo.push((now, now + slice)),
+                if class == Class::Fifo {
+                    match fifo[cpu].last_mut() {
+                        Some((_, end)) if *end == now => *end += slice,
+                        _ => fifo[cpu].push((now, now + slice)),
+                    }
                 }
                 now += slice;
                 ran += slice;
