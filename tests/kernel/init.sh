@@ -12,6 +12,10 @@ while read -r module options; do
 	# $options is split into words.
 	insmod "$module" $options || echo "cannot load $module"
 done </tests/modules
+# Tests with ADCs bind them again (guest/mock/adc.rs).
+for adc in /sys/bus/platform/drivers/mock-adc/mock-adc.*; do
+	echo "${adc##*/}" >/sys/bus/platform/drivers/mock-adc/unbind
+done
 mount -t configfs configfs /sys/kernel/config
 mount -t debugfs debugfs /sys/kernel/debug
 mount -t tracefs tracefs /sys/kernel/tracing

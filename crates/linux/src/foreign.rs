@@ -73,7 +73,8 @@ const UNSEEN: [RangeInclusive<char>; 18] = [
 /// Whether a character of a name may not be shown. The C0 and C1 controls and DEL have meanings to terminals. A line
 /// feed would begin a line that passes for one of ours. A mark such as U+202E shows the rest of the line backwards.
 pub fn is_unseen(c: char) -> bool {
-    c.is_control() || UNSEEN.iter().any(|range| range.contains(&c))
+    // The ranges begin above ASCII, which most characters are.
+    c.is_control() || (!c.is_ascii() && UNSEEN.iter().any(|range| range.contains(&c)))
 }
 
 /// A text as part of one line for a terminal or a log. Each character that is not seen is replaced.

@@ -19,6 +19,7 @@ use nix::unistd::Pid;
 use pinion_client::config::Config;
 use pinion_client::{Client, Error};
 
+use super::mock::adc::Adcs;
 use super::{sysfs, uapi};
 
 /// Timeout of a test: far longer than any operation takes.
@@ -29,6 +30,7 @@ pub struct Program {
     child: Child,
     link: PathBuf,
     log: PathBuf,
+    _adcs: Option<Adcs>,
 }
 
 impl Program {
@@ -79,7 +81,9 @@ impl Program {
     }
 
     fn measured_with(args: &[&str]) -> Program {
-        match other() {
+        // A printer's computer has some.
+        let adcs = Adcs::new();
+        let mut program = match other() {
             Some(words) => {
                 let mut words = words.split_whitespace();
                 let mut command = Command::new(words.next().expect("a program"));
@@ -87,7 +91,9 @@ impl Program {
                 Program::spawn(command).ready()
             }
             None => Program::with(args, &[]),
-        }
+        };
+        program._adcs = Some(adcs);
+        program
     }
 
     fn spawn(mut command: Command) -> Program {
@@ -102,7 +108,7 @@ impl Program {
             .stderr(File::create(&log).expect("a log"))
             .spawn()
             .unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        Program { child, link, log }
+        Program { child, link, log, _adcs: None }
     }
 
     /// Waits until a host may connect to its pty.

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use nix::time::{ClockId, clock_gettime};
+
 /// An idle guest's time passes at once, and a look costs an emulated processor much. No multiple of a PWM's cycle.
 pub const POLL_INTERVAL: Duration = Duration::from_millis(13);
 
@@ -65,6 +67,11 @@ pub fn entry_with(folder: &str, name: &str, value: &str) -> PathBuf {
         .map(|entry| entry.expect("a readable folder").path())
         .find(|path| fs::read_to_string(path.join(name)).is_ok_and(|it| it.trim_end() == value))
         .unwrap_or_else(|| panic!("nothing in {folder} has {value:?} in its {name}"))
+}
+
+/// CLOCK_MONOTONIC, which traces and Pinion's log have, too.
+pub fn monotonic() -> Duration {
+    clock_gettime(ClockId::CLOCK_MONOTONIC).expect("every kernel has this clock").into()
 }
 
 /// Waits for the result of another thread or process.

@@ -87,20 +87,20 @@ fn unchanged_files(smaps: &str) -> Vec<(Range<usize>, PathBuf)> {
     let mut found = Vec::new();
     let mut mapping = None;
     let mut own_kb = Vec::new();
-    // The last line of a mapping has its flags.
+    // The last line of a mapping has its flags. Words are looked for in its first line only: each start reads thousands
+    // of lines.
     for line in smaps.lines() {
-        let mut words = line.split_ascii_whitespace();
-        match (words.next(), words.next()) {
-            (Some("Anonymous:" | "Swap:"), Some(kb)) => own_kb.push(kb.to_owned()),
-            (Some("VmFlags:"), _) => {
-                found.extend(mapping.take().filter(|_| own_kb == ["0", "0"]));
-                own_kb.clear();
-            }
-            (Some(range), Some("r-xp" | "r--p")) => {
+        if let Some(kb) = line.strip_prefix("Anonymous:").or_else(|| line.strip_prefix("Swap:")) {
+            own_kb.push(kb.trim());
+        } else if line.starts_with("VmFlags:") {
+            found.extend(mapping.take().filter(|_| own_kb == ["0 kB", "0 kB"]));
+            own_kb.clear();
+        } else if !line.starts_with(|letter: char| letter.is_ascii_uppercase()) {
+            let mut words = line.split_ascii_whitespace();
+            if let (Some(range), Some("r-xp" | "r--p")) = (words.next(), words.next()) {
                 // No other field has a slash, and a path may have spaces.
                 mapping = line.find('/').and_then(|at| Some((parse_range(range)?, PathBuf::from(&line[at..]))));
             }
-            _ => {}
         }
     }
     found

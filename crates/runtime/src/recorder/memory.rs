@@ -136,9 +136,11 @@ impl Memory {
     pub(super) fn set_names(self, names: &Names) {
         let json = [serde_json::to_string(names), serde_json::to_string(&Names::default())];
         let Some(json) = json.into_iter().flatten().find(|json| json.len() <= NAMES_BYTES) else { return };
-        let mut bytes = json.bytes();
-        let words =
-            (0..json.len().div_ceil(8)).map(|_| u64::from_le_bytes(std::array::from_fn(|_| bytes.next().unwrap_or(0))));
+        let words = json.as_bytes().chunks(8).map(|bytes| {
+            let mut word = [0; 8];
+            word[..bytes.len()].copy_from_slice(bytes);
+            u64::from_le_bytes(word)
+        });
         self.kept_names().store(iter::once(json.len() as u64).chain(words));
     }
 

@@ -37,6 +37,7 @@ fn reading(client: &mut Client, oid: u8) -> u16 {
 
 #[test]
 fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
+    let _adcs = adc::Adcs::new();
     // Raw readings, and the values that the host gets for them.
     let channels: [(&str, [(i32, u16); 3]); 7] = [
         ("mock-adc12", [(0, 0), (2048, 2048), (4095, 4095)]),
@@ -83,6 +84,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
 
 #[test]
 fn a_device_that_fails_or_disappears_stops_the_mcu_by_name() {
+    let _adcs = adc::Adcs::new();
     let device = |name| adc::device(name).file_name().and_then(|name| name.to_str()).expect("a name").to_owned();
     let (first, second) = (device("mock-adc12"), device("mock-adc8"));
     let program = Program::start();
@@ -115,6 +117,7 @@ fn a_device_that_fails_or_disappears_stops_the_mcu_by_name() {
 
 #[test]
 fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
+    let _adcs = adc::Adcs::new();
     let program = Program::start();
     let client = &mut program.connect();
     assert_eq!(refusal(client, 1, &[input(0, "gpio3")]), "Unable to open adc device");
@@ -125,6 +128,7 @@ fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
 
 #[test]
 fn steps_do_not_wait_for_a_slow_reading() {
+    let _adcs = adc::Adcs::new();
     const STEPS: u32 = 600;
     let sim = GpioSim::new("lab", 8);
     let program = Program::start();

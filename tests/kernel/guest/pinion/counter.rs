@@ -7,7 +7,6 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use pinion_client::Client;
-use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, refusal, run};
@@ -58,9 +57,9 @@ fn edges(sim: &GpioSim, count: u32) -> (Duration, Duration) {
     let mut pull = sim.pull_file(TACHO);
     let mut last = (Duration::ZERO, Duration::ZERO);
     for edge in 0..count {
-        let before = monotonic();
+        let before = sysfs::monotonic();
         set(&mut pull, edge % 2 == 0);
-        last = (before, monotonic());
+        last = (before, sysfs::monotonic());
     }
     last
 }
@@ -129,10 +128,10 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
         set(&mut pull, level);
         thread::sleep(Duration::from_millis(80));
         for _ in 0..50 {
-            let began = monotonic();
+            let began = sysfs::monotonic();
             set(&mut pull, !level);
             set(&mut pull, level);
-            longest = longest.max(monotonic() - began);
+            longest = longest.max(sysfs::monotonic() - began);
         }
     }
     thread::sleep(Duration::from_millis(80));

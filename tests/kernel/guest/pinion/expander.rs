@@ -14,7 +14,6 @@ use nix::sys::signal::Signal;
 use pinion_client::Client;
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
-use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::mock::i2c;
@@ -166,7 +165,7 @@ impl Setup {
 }
 
 fn now_us() -> u64 {
-    monotonic().as_micros() as u64
+    sysfs::monotonic().as_micros() as u64
 }
 
 #[test]

@@ -11,7 +11,6 @@ use std::time::Duration;
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use pinion_linux::clock::monotonic;
 
 use super::outputs::Outputs;
 use crate::gpio_sim::GpioSim;
@@ -30,7 +29,7 @@ fn end_by(outputs: &Outputs, signal: Signal) -> String {
     let guardian = program.guardian();
     let trace = Trace::start();
     outputs.wait_until_on();
-    let began_us = monotonic().as_micros() as u64;
+    let began_us = sysfs::monotonic().as_micros() as u64;
     program.signal(signal);
     if signal == Signal::SIGSEGV {
         // Rust's handler treats the first signal as a possible stack overflow, and waits for the access to fail again.
@@ -113,7 +112,7 @@ fn lose_guardian_by(signal: Signal, words: &str) -> u64 {
     let guardian = program.guardian();
     let trace = Trace::start();
     outputs.wait_until_on();
-    let began_us = monotonic().as_micros() as u64;
+    let began_us = sysfs::monotonic().as_micros() as u64;
     kill(guardian, signal).expect("a guardian");
     assert_eq!(shutdown_of(&mut client), "Guardian process lost");
     let safe_us = outputs.assert_safe(&trace);

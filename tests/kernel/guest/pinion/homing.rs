@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
-use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::Program;
+use crate::sysfs;
 use crate::trace::Trace;
 
 const SWITCH: u32 = 2;
@@ -37,7 +37,7 @@ fn an_axis_homes_backs_off_and_homes_again() {
         let homed = queue.home(client, stepper, endstop, false, &profile(3000), &mut |sight| {
             if closed_ns.is_none() && sight.position <= switch_at {
                 sim.pull(SWITCH, false);
-                closed_ns = Some(monotonic().as_nanos() as u64);
+                closed_ns = Some(sysfs::monotonic().as_nanos() as u64);
             }
         });
         let homed = homed.expect("a homing");

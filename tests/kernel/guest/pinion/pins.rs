@@ -48,6 +48,7 @@ fn names_directions_and_holders_are_listed() {
 
 #[test]
 fn adcs_are_listed_with_resolution_and_reading() {
+    let _adcs = adc::Adcs::new();
     sysfs::write(adc::raw("mock-adc10", 3), "341");
     let list = pins(&["mock-adc10"]);
     assert!(list.contains("mock-adc10, 8 channels"), "{list}");
