@@ -34,7 +34,7 @@ use vm::Run;
 const FAILED: u8 = 101;
 
 /// Highest number of tests in one VM.
-const TESTS_IN_A_VM: usize = 32;
+const TESTS_IN_A_VM: usize = 64;
 
 /// Tests with figures that are compared with another run or another program. They have their own VM, so that their
 /// figures do not depend on earlier tests. They take long, and run only if a filter asks for them.
