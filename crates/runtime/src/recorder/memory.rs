@@ -136,11 +136,8 @@ impl Memory {
     pub(super) fn set_names(self, names: &Names) {
         let json = [serde_json::to_string(names), serde_json::to_string(&Names::default())];
         let Some(json) = json.into_iter().flatten().find(|json| json.len() <= NAMES_BYTES) else { return };
-        let words = json.as_bytes().chunks(8).map(|bytes| {
-            let mut word = [0; 8];
-            word[..bytes.len()].copy_from_slice(bytes);
-            u64::from_le_bytes(word)
-        });
+        let word = |bytes: &[u8]| bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte));
+        let words = json.as_bytes().chunks(8).map(word);
         self.kept_names().store(iter::once(json.len() as u64).chain(words));
     }
 
