@@ -58,7 +58,7 @@ help:
 	@echo 'make test          the tests for each change, with those on real kernel drivers in a virtual machine'
 	@echo 'make test-all      all tests (tests/README.md): the former, make check and what takes long; as root also'
 	@echo '                   the package, and with KLIPPER_DIR=~/klipper a real klippy'
-	@echo 'make test-slow     tests in which heaters and motors take their real time, and of drivers that hang'
+	@echo 'make test-slow     tests in which heaters and motors take their real time, and on drivers the rarer ones'
 	@echo 'make test-kernel   all tests on real kernel drivers, on two kernels'
 	@echo 'make figures       figures of the program in that virtual machine (docs/develop/performance.md)'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
@@ -102,8 +102,8 @@ build: system-packages-build
 EMULATES = $(filter x86_64,$(shell uname -m))
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
 TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
-# `make test-slow` has what hangs or is stopped. `make test-kernel` has the drivers and mocks themselves, and a hundred
-# thousand frames of a CAN bus.
+# `make test-slow` has faults, refusals and old kernels. `make test-kernel` has the drivers and mocks themselves, and a
+# hundred thousand frames of a CAN bus.
 DRIVERS = --flavour stock --skip selftest:: --skip slow:: --skip floods::
 
 # Most tests of the programs wait, and most of those on drivers compute: both take hardly longer than one of them.

@@ -115,41 +115,46 @@ fn a_device_that_fails_or_disappears_stops_the_mcu_by_name() {
     reading(client, 0);
 }
 
-#[test]
-fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
-    let _adcs = adc::Adcs::new();
-    let program = Program::start();
-    let client = &mut program.connect();
-    assert_eq!(refusal(client, 1, &[input(0, "gpio3")]), "Unable to open adc device");
-    program.wait_for_line(&["gpiochip0 line 3 is not an ADC channel"]);
-    assert_eq!(refusal(client, 1, &[input(0, "33619967")]), "Unable to open adc device");
-    program.wait_for_line(&["there is no channel 255 on iio:device255", "mock-adc12: voltage0 voltage1"]);
-}
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
 
-#[test]
-fn steps_do_not_wait_for_a_slow_reading() {
-    let _adcs = adc::Adcs::new();
-    const STEPS: u32 = 600;
-    let sim = GpioSim::new("lab", 8);
-    let program = Program::start();
-    let client = &mut program.connect();
-    let mut config = Config::default();
-    let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
-    let oid = config.oid().expect("few objects");
-    config.add(input(oid.into(), "mock-adc12/voltage0"));
-    let status = config.apply(client).expect("a configuration that it takes");
-    let delay = sysfs::set("/sys/devices/platform/mock-adc.0/delay_ms", "100", "0");
-    query(client, oid.into());
-    let trace = Trace::start();
-    let even = Profile::trapezoid(STEPS, 1000.0, f64::INFINITY, 50e6).expect("a profile");
-    MoveQueue::new(status.move_count).run(client, stepper, true, &even, None).expect("a move");
-    drop(delay);
-    let readings = client.drain().iter().filter(|response| response.name == "analog_in_state").count();
-    assert!((4..=9).contains(&readings), "{readings} readings of 100 ms each in a second");
-    let writes = trace.writes_to(sim.kernel_number(0));
-    let rising: Vec<u64> = writes.iter().filter(|write| write.level).map(|write| write.at_ns).collect();
-    assert_eq!(rising.len(), STEPS as usize);
-    let longest = rising.windows(2).map(|pair| pair[1] - pair[0]).max().expect("steps");
-    println!("{readings} readings, and at most {longest} ns between two steps");
-    assert!(longest < 1_200_000, "{longest} ns between two steps of 1 ms");
+    #[test]
+    fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
+        let _adcs = adc::Adcs::new();
+        let program = Program::start();
+        let client = &mut program.connect();
+        assert_eq!(refusal(client, 1, &[input(0, "gpio3")]), "Unable to open adc device");
+        program.wait_for_line(&["gpiochip0 line 3 is not an ADC channel"]);
+        assert_eq!(refusal(client, 1, &[input(0, "33619967")]), "Unable to open adc device");
+        program.wait_for_line(&["there is no channel 255 on iio:device255", "mock-adc12: voltage0 voltage1"]);
+    }
+
+    #[test]
+    fn steps_do_not_wait_for_a_slow_reading() {
+        let _adcs = adc::Adcs::new();
+        const STEPS: u32 = 600;
+        let sim = GpioSim::new("lab", 8);
+        let program = Program::start();
+        let client = &mut program.connect();
+        let mut config = Config::default();
+        let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+        let oid = config.oid().expect("few objects");
+        config.add(input(oid.into(), "mock-adc12/voltage0"));
+        let status = config.apply(client).expect("a configuration that it takes");
+        let delay = sysfs::set("/sys/devices/platform/mock-adc.0/delay_ms", "100", "0");
+        query(client, oid.into());
+        let trace = Trace::start();
+        let even = Profile::trapezoid(STEPS, 1000.0, f64::INFINITY, 50e6).expect("a profile");
+        MoveQueue::new(status.move_count).run(client, stepper, true, &even, None).expect("a move");
+        drop(delay);
+        let readings = client.drain().iter().filter(|response| response.name == "analog_in_state").count();
+        assert!((4..=9).contains(&readings), "{readings} readings of 100 ms each in a second");
+        let writes = trace.writes_to(sim.kernel_number(0));
+        let rising: Vec<u64> = writes.iter().filter(|write| write.level).map(|write| write.at_ns).collect();
+        assert_eq!(rising.len(), STEPS as usize);
+        let longest = rising.windows(2).map(|pair| pair[1] - pair[0]).max().expect("steps");
+        println!("{readings} readings, and at most {longest} ns between two steps");
+        assert!(longest < 1_200_000, "{longest} ns between two steps of 1 ms");
+    }
 }

@@ -22,13 +22,6 @@ fn buttons_are_added_after_the_configuration_and_once_more_after_a_restart() {
     add_twice(&Program::start());
 }
 
-#[test]
-fn buttons_are_added_once_more_on_linux_before_5_5() {
-    for errno in [Errno::EINVAL, Errno::ENOTTY] {
-        add_twice(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, errno));
-    }
-}
-
 fn add_twice(program: &Program) {
     let sim = GpioSim::new("lab", 8);
     let client = &mut program.connect();
@@ -42,6 +35,18 @@ fn add_twice(program: &Program) {
         for (offset, up, pressed) in [(3, true, 1), (4, true, 3), (3, false, 2), (4, false, 0)] {
             sim.pull(offset, up);
             assert_eq!(state(client), [pressed]);
+        }
+    }
+}
+
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn buttons_are_added_once_more_on_linux_before_5_5() {
+        for errno in [Errno::EINVAL, Errno::ENOTTY] {
+            add_twice(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, errno));
         }
     }
 }

@@ -212,63 +212,6 @@ fn a_node_is_found_assigned_and_asked() {
     }
 }
 
-#[test]
-fn a_host_that_begins_anew_gets_the_node_again() {
-    let _interface = Interface::new();
-    let program = start();
-    let (host, client) = Host::connect(false);
-    drop((host, client));
-    // It does not wait for the first one's silence.
-    let (_host, mut client) = Host::connect(false);
-    program.wait_for_line(&["host gone"]);
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    sysfs::wait_until("the second host is attached", || program.log().matches("host attached").count() == 2);
-}
-
-#[test]
-fn an_interface_that_goes_down_and_comes_back_is_used_again() {
-    let interface = Interface::new();
-    let program = start();
-    let (host, mut client) = Host::connect(false);
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    ip(&format!("link set {INTERFACE} down"));
-    program.wait_for_line(&["vcan0 is down: sudo ip link set vcan0 up"]);
-    ip(&format!("link set {INTERFACE} up"));
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    program.wait_for_line(&["vcan0 is up"]);
-    drop((host, client));
-    // An adapter on USB that is pulled out, and plugged in again.
-    drop(interface);
-    program.wait_for_line(&["vcan0 is gone"]);
-    let _interface = Interface::new();
-    program.wait_for_line(&["vcan0 is there"]);
-    let (_host, mut client) = Host::connect(false);
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-}
-
-#[test]
-fn an_interface_that_comes_later_is_waited_for() {
-    let program = Program::on_link(&format!("can:{INTERFACE},{UUID}"));
-    program.wait_for_line(&["there is no CAN interface vcan0"]);
-    let _interface = Interface::new();
-    program.wait_for_line(&["vcan0 is there"]);
-    let (_host, mut client) = Host::connect(false);
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-}
-
-#[test]
-fn another_node_with_the_same_nodeid_stops_the_mcu() {
-    let _interface = Interface::new();
-    let program = start();
-    let (_host, mut client) = Host::connect(false);
-    client.query("get_uptime", &[], "uptime", None).expect("an answer");
-    assign(&bus(), [9; 6], NODE_ID);
-    program.wait_for_line(&["Another CAN node assigned this ID", "give each node another canbus_uuid"]);
-    // The host finds it again, and hears why.
-    assign(&bus(), UUID_BYTES, NODE_ID);
-    assert!(client.status().expect("an answer").is_shutdown);
-}
-
 /// A heater with pulses, which its host has to refresh within half a second.
 const HEATER: [&str; 2] = [
     "config_digital_out oid=0 pin=lab/gpio1 value=0 default_value=0 max_duration=25000000",
@@ -504,6 +447,63 @@ mod slow {
         let log = program.log();
         assert!(log.contains("is off the bus after too many errors"), "{log}");
         assert!(log.lines().count() < LINES_MAX, "{} lines", log.lines().count());
+    }
+
+    #[test]
+    fn a_host_that_begins_anew_gets_the_node_again() {
+        let _interface = Interface::new();
+        let program = start();
+        let (host, client) = Host::connect(false);
+        drop((host, client));
+        // It does not wait for the first one's silence.
+        let (_host, mut client) = Host::connect(false);
+        program.wait_for_line(&["host gone"]);
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        sysfs::wait_until("the second host is attached", || program.log().matches("host attached").count() == 2);
+    }
+
+    #[test]
+    fn an_interface_that_goes_down_and_comes_back_is_used_again() {
+        let interface = Interface::new();
+        let program = start();
+        let (host, mut client) = Host::connect(false);
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        ip(&format!("link set {INTERFACE} down"));
+        program.wait_for_line(&["vcan0 is down: sudo ip link set vcan0 up"]);
+        ip(&format!("link set {INTERFACE} up"));
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        program.wait_for_line(&["vcan0 is up"]);
+        drop((host, client));
+        // An adapter on USB that is pulled out, and plugged in again.
+        drop(interface);
+        program.wait_for_line(&["vcan0 is gone"]);
+        let _interface = Interface::new();
+        program.wait_for_line(&["vcan0 is there"]);
+        let (_host, mut client) = Host::connect(false);
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+    }
+
+    #[test]
+    fn another_node_with_the_same_nodeid_stops_the_mcu() {
+        let _interface = Interface::new();
+        let program = start();
+        let (_host, mut client) = Host::connect(false);
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
+        assign(&bus(), [9; 6], NODE_ID);
+        program.wait_for_line(&["Another CAN node assigned this ID", "give each node another canbus_uuid"]);
+        // The host finds it again, and hears why.
+        assign(&bus(), UUID_BYTES, NODE_ID);
+        assert!(client.status().expect("an answer").is_shutdown);
+    }
+
+    #[test]
+    fn an_interface_that_comes_later_is_waited_for() {
+        let program = Program::on_link(&format!("can:{INTERFACE},{UUID}"));
+        program.wait_for_line(&["there is no CAN interface vcan0"]);
+        let _interface = Interface::new();
+        program.wait_for_line(&["vcan0 is there"]);
+        let (_host, mut client) = Host::connect(false);
+        client.query("get_uptime", &[], "uptime", None).expect("an answer");
     }
 }
 

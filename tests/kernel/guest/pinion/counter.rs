@@ -141,32 +141,6 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
 }
 
 #[test]
-fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
-    let (sim, program, mut client) = counting(SLOW);
-    let client = &mut client;
-    // The kernel lists the consumers of interrupts.
-    let has_interrupt = || sysfs::read("/proc/interrupts").lines().any(|line| line.ends_with("pinion"));
-    assert!(has_interrupt());
-    let mut pull = sim.pull_file(TACHO);
-    let until = Instant::now() + Duration::from_secs(5);
-    while !program.log().contains("polled from now on") {
-        assert!(Instant::now() < until, "{}", program.log());
-        (0..2000).for_each(|edge| set(&mut pull, edge % 2 == 0));
-    }
-    assert!(!has_interrupt());
-    let (before, _) = settled(client);
-    // First shorter than the polling interval, so that one read may see the pin high; then longer.
-    edges(&sim, 100);
-    let (low, _) = settled(client);
-    assert!(low - before <= 2, "{}", low - before);
-    sim.pull(TACHO, true);
-    assert_eq!(settled(client).0, low + 1);
-    sim.pull(TACHO, false);
-    configure(client, 1, &["config_digital_out oid=0 pin=lab/gpio3 value=1 default_value=1 max_duration=0"]);
-    assert!(sim.level(TACHO));
-}
-
-#[test]
 fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
     let sim = GpioSim::new("lab", 8);
     let program = Program::start();
@@ -200,4 +174,35 @@ fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
     let output = "config_digital_out oid=1 pin=lab/gpio3 value=0 default_value=0 max_duration=0";
     assert_eq!(refusal(client, 2, &[COUNTER, output]), "Unable to open out GPIO chip line");
     program.wait_for_line(&["line 3 counts pulses and cannot be an output as well"]);
+}
+
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
+        let (sim, program, mut client) = counting(SLOW);
+        let client = &mut client;
+        // The kernel lists the consumers of interrupts.
+        let has_interrupt = || sysfs::read("/proc/interrupts").lines().any(|line| line.ends_with("pinion"));
+        assert!(has_interrupt());
+        let mut pull = sim.pull_file(TACHO);
+        let until = Instant::now() + Duration::from_secs(5);
+        while !program.log().contains("polled from now on") {
+            assert!(Instant::now() < until, "{}", program.log());
+            (0..2000).for_each(|edge| set(&mut pull, edge % 2 == 0));
+        }
+        assert!(!has_interrupt());
+        let (before, _) = settled(client);
+        // First shorter than the polling interval, so that one read may see the pin high; then longer.
+        edges(&sim, 100);
+        let (low, _) = settled(client);
+        assert!(low - before <= 2, "{}", low - before);
+        sim.pull(TACHO, true);
+        assert_eq!(settled(client).0, low + 1);
+        sim.pull(TACHO, false);
+        configure(client, 1, &["config_digital_out oid=0 pin=lab/gpio3 value=1 default_value=1 max_duration=0"]);
+        assert!(sim.level(TACHO));
+    }
 }

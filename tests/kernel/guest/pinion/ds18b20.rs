@@ -68,25 +68,30 @@ fn sensors_are_read_by_name_and_one_that_is_taken_away_stops_the_mcu() {
     assert_eq!(shutdown_of(client), "DS18B20 out of range");
 }
 
-#[test]
-fn a_sensor_that_is_being_read_keeps_no_restart_waiting() {
-    sysfs::wait_until("the bus was searched", || {
-        std::fs::exists(format!("/sys/bus/w1/devices/{}/w1_slave", sensor(1))).unwrap_or(false)
-    });
-    sysfs::write(format!("{MOCK}/temperature"), "0 20000");
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure(client, 1, &[config(0, &sensor(1))]);
-    query(client, 0, -55_000);
-    // It measures from 100 to 850 ms.
-    std::thread::sleep(Duration::from_millis(200));
-    let began = Instant::now();
-    client.reset().expect("a reset");
-    configure(client, 1, &[config(0, &sensor(1))]);
-    let took = began.elapsed();
-    println!("restarted within {took:?}");
-    assert!(took < Duration::from_millis(400), "{took:?}");
-    query(client, 0, -55_000);
-    assert_eq!(reading(client, 0), (20_000, 0));
-    assert!(!program.log().contains("does not answer"), "{}", program.log());
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_sensor_that_is_being_read_keeps_no_restart_waiting() {
+        sysfs::wait_until("the bus was searched", || {
+            std::fs::exists(format!("/sys/bus/w1/devices/{}/w1_slave", sensor(1))).unwrap_or(false)
+        });
+        sysfs::write(format!("{MOCK}/temperature"), "0 20000");
+        let program = Program::start();
+        let client = &mut program.connect();
+        configure(client, 1, &[config(0, &sensor(1))]);
+        query(client, 0, -55_000);
+        // It measures from 100 to 850 ms.
+        std::thread::sleep(Duration::from_millis(200));
+        let began = Instant::now();
+        client.reset().expect("a reset");
+        configure(client, 1, &[config(0, &sensor(1))]);
+        let took = began.elapsed();
+        println!("restarted within {took:?}");
+        assert!(took < Duration::from_millis(400), "{took:?}");
+        query(client, 0, -55_000);
+        assert_eq!(reading(client, 0), (20_000, 0));
+        assert!(!program.log().contains("does not answer"), "{}", program.log());
+    }
 }

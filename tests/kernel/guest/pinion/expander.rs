@@ -169,62 +169,6 @@ fn now_us() -> u64 {
 }
 
 #[test]
-fn steps_beside_a_slow_output_are_in_time() {
-    let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
-    let program = Program::start();
-    let client = &mut program.connect();
-    let mut config = Config::default();
-    Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
-    config.oid().expect("few objects");
-    config.add(output(1, &expander.pin(5)));
-    config.apply(client).expect("a configuration that it takes");
-    let step = sim.kernel_number(0);
-    let _slow = expander.slow_down(50);
-    sysfs::write(format!("{MOCK}/sent"), "0");
-    let trace = Trace::start();
-    let start = client.clock_in(0.2).expect("the clock").wire();
-    for line in [
-        format!("reset_step_clock oid=0 clock={start}"),
-        "queue_step oid=0 interval=50000 count=1000 add=0".to_owned(),
-        format!("queue_digital_out oid=1 clock={start} on_ticks=1"),
-        format!("queue_digital_out oid=1 clock={} on_ticks=0", start.wrapping_add(client.ticks(0.3))),
-    ] {
-        run(client, &line);
-    }
-    // A command that makes the host wait.
-    thread::sleep(Duration::from_millis(800));
-    let began_us = now_us();
-    run(client, "update_digital_out oid=1 value=1");
-    assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
-    thread::sleep(Duration::from_millis(500));
-    sysfs::wait_until("all steps are made", || trace.writes_to(step).len() >= 2000);
-    let edges = trace.writes_to(step);
-    let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
-    assert_eq!(rising.len(), 1000);
-    let worst = rising.iter().zip(0..).map(|(at_us, n)| (at_us - rising[0]).abs_diff(1000 * n)).max();
-    println!("steps stray by {worst:?} us");
-    assert!(worst.expect("steps") < 200, "{worst:?} us");
-    let sent = sysfs::read(format!("{MOCK}/sent"));
-    let outputs: Vec<&str> = sent.lines().filter(|line| line.starts_with("50 01 ")).collect();
-    assert_eq!(outputs, ["50 01 ff", "50 01 df", "50 01 ff"]);
-}
-
-#[test]
-fn a_step_pin_on_it_is_refused_with_the_reason() {
-    let (_sim, expander) = (GpioSim::new("lab", 8), Expander::new());
-    let program = Program::start();
-    let client = &mut program.connect();
-    for (step, dir) in [(expander.pin(0), "lab/gpio1".to_owned()), ("lab/gpio0".to_owned(), expander.pin(1))] {
-        let config = format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100");
-        assert_eq!(refusal(client, 1, &[config]), "Unable to open out GPIO chip line");
-    }
-    for (pin, what) in [(0, "a step pin"), (1, "a dir pin")] {
-        program.wait_for_line(&[&expander.pin(pin), what, "behind a bus", "choose a pin of the processor itself"]);
-    }
-    configure(client, 1, &[output(0, &expander.pin(0))]);
-}
-
-#[test]
 fn an_axis_homes_to_an_endstop_on_it() {
     const SWITCH: u32 = 7;
     let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
@@ -258,51 +202,6 @@ fn an_axis_homes_to_an_endstop_on_it() {
     let rising = trace.writes_to(step).iter().filter(|write| write.level).count();
     assert_eq!(homed.position, -(rising as i64), "it is where the lines say");
     assert!((-3000..=-700).contains(&homed.position), "{}", homed.position);
-}
-
-#[test]
-fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
-    let (mut setup, mut client) = Setup::on();
-    let trace = Trace::start();
-    let guardian = setup.program.guardian();
-    let hangs = setup.expander.slow_down(HANGS_MS);
-    // A worker is in the driver while the MCU continues to run.
-    let at = client.clock_in(0.1).expect("the clock").wire();
-    run(&mut client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
-    thread::sleep(Duration::from_secs(2));
-    assert!(setup.sim.level(0) && setup.program.is_running());
-    let began_us = now_us();
-    setup.program.signal(Signal::SIGKILL);
-    setup.assert_heater_off(&trace, began_us, WITHIN_US);
-    setup.program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
-    sysfs::wait_until("the guardian ends", || !exists(guardian));
-    assert!(!exists(setup.program.pid()));
-    drop(hangs);
-    drop(trace);
-    setup.assert_starts_anew();
-}
-
-#[test]
-fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
-    let (mut setup, mut client) = Setup::on();
-    let silent = setup.expander.fall_silent();
-    client.send_line("update_digital_out oid=1 value=0").expect("a session");
-    assert_eq!(shutdown_of(&mut client), "GPIO line write failed");
-    assert!(!setup.sim.level(0), "the heater is off");
-    let (line, fan) = (setup.expander.line(3), setup.fan());
-    let program = &mut setup.program;
-    program.wait_for_line(&["shutdown: GPIO line write failed", &fan, &line, "its chip does not answer"]);
-    thread::sleep(Duration::from_millis(300));
-    assert!(!program.log().contains("after all"));
-    drop(silent);
-    program.wait_for_line(&[&fan, "is at its shutdown value after all"]);
-    assert!(!setup.expander.level(3));
-    // No help was necessary.
-    thread::sleep(Duration::from_secs(2));
-    assert!(program.is_running());
-    assert!(!program.log().contains("guardian"), "{}", program.log());
-    client.reset().expect("a reset");
-    setup.switch_on(&mut client);
 }
 
 #[test]
@@ -384,40 +283,6 @@ fn stops_silent(expander: &Expander, client: &mut Client, after_us: Range<u64>) 
     println!("stopped after {took_us} us");
     assert!(after_us.contains(&took_us), "{took_us} us");
     silent
-}
-
-#[test]
-fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
-    let (expander, program, mut client) = with_inputs();
-    let client = &mut client;
-    let silent = stops_silent(&expander, client, 95_000..130_000);
-    program.wait_for_line(&[
-        "shutdown: GPIO line read failed",
-        &expander.chip_name,
-        "its chip does not answer",
-        "check",
-    ]);
-    drop(silent);
-    client.reset().expect("a reset");
-    configure_inputs(client, &expander);
-}
-
-#[test]
-fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
-    let (expander, program, mut client) = with_inputs();
-    let client = &mut client;
-    let start = client.clock_in(0.05).expect("the clock").wire();
-    run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
-    // Every 2 ms.
-    run(
-        client,
-        &format!(
-            "endstop_home oid=1 clock={start} sample_ticks=750 sample_count=4 rest_ticks=100000 pin_value=1 trsync_oid=2 trigger_reason=1"
-        ),
-    );
-    thread::sleep(Duration::from_millis(200));
-    let _silent = stops_silent(&expander, client, 0..20_000);
-    program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
 }
 
 /// `make test-slow` has them.
@@ -526,5 +391,146 @@ mod slow {
         configure_inputs(client, &expander);
         thread::sleep(Duration::from_millis(200));
         assert!(!client.status().expect("a session").is_shutdown);
+    }
+
+    #[test]
+    fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
+        let (mut setup, mut client) = Setup::on();
+        let trace = Trace::start();
+        let guardian = setup.program.guardian();
+        let hangs = setup.expander.slow_down(HANGS_MS);
+        // A worker is in the driver while the MCU continues to run.
+        let at = client.clock_in(0.1).expect("the clock").wire();
+        run(&mut client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
+        thread::sleep(Duration::from_secs(2));
+        assert!(setup.sim.level(0) && setup.program.is_running());
+        let began_us = now_us();
+        setup.program.signal(Signal::SIGKILL);
+        setup.assert_heater_off(&trace, began_us, WITHIN_US);
+        setup.program.wait_for_line(&[
+            "guardian: ",
+            "only 1 of 2 outputs",
+            &setup.expander.line(3),
+            "its driver hangs",
+        ]);
+        sysfs::wait_until("the guardian ends", || !exists(guardian));
+        assert!(!exists(setup.program.pid()));
+        drop(hangs);
+        drop(trace);
+        setup.assert_starts_anew();
+    }
+
+    #[test]
+    fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
+        let (expander, program, mut client) = with_inputs();
+        let client = &mut client;
+        let silent = stops_silent(&expander, client, 95_000..130_000);
+        program.wait_for_line(&[
+            "shutdown: GPIO line read failed",
+            &expander.chip_name,
+            "its chip does not answer",
+            "check",
+        ]);
+        drop(silent);
+        client.reset().expect("a reset");
+        configure_inputs(client, &expander);
+    }
+
+    #[test]
+    fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
+        let (mut setup, mut client) = Setup::on();
+        let silent = setup.expander.fall_silent();
+        client.send_line("update_digital_out oid=1 value=0").expect("a session");
+        assert_eq!(shutdown_of(&mut client), "GPIO line write failed");
+        assert!(!setup.sim.level(0), "the heater is off");
+        let (line, fan) = (setup.expander.line(3), setup.fan());
+        let program = &mut setup.program;
+        program.wait_for_line(&["shutdown: GPIO line write failed", &fan, &line, "its chip does not answer"]);
+        thread::sleep(Duration::from_millis(300));
+        assert!(!program.log().contains("after all"));
+        drop(silent);
+        program.wait_for_line(&[&fan, "is at its shutdown value after all"]);
+        assert!(!setup.expander.level(3));
+        // No help was necessary.
+        thread::sleep(Duration::from_secs(2));
+        assert!(program.is_running());
+        assert!(!program.log().contains("guardian"), "{}", program.log());
+        client.reset().expect("a reset");
+        setup.switch_on(&mut client);
+    }
+
+    #[test]
+    fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
+        let (expander, program, mut client) = with_inputs();
+        let client = &mut client;
+        let start = client.clock_in(0.05).expect("the clock").wire();
+        run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
+        // Every 2 ms.
+        run(
+            client,
+            &format!(
+                "endstop_home oid=1 clock={start} sample_ticks=750 sample_count=4 rest_ticks=100000 pin_value=1 trsync_oid=2 trigger_reason=1"
+            ),
+        );
+        thread::sleep(Duration::from_millis(200));
+        let _silent = stops_silent(&expander, client, 0..20_000);
+        program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
+    }
+
+    #[test]
+    fn steps_beside_a_slow_output_are_in_time() {
+        let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+        let program = Program::start();
+        let client = &mut program.connect();
+        let mut config = Config::default();
+        Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+        config.oid().expect("few objects");
+        config.add(output(1, &expander.pin(5)));
+        config.apply(client).expect("a configuration that it takes");
+        let step = sim.kernel_number(0);
+        let _slow = expander.slow_down(50);
+        sysfs::write(format!("{MOCK}/sent"), "0");
+        let trace = Trace::start();
+        let start = client.clock_in(0.2).expect("the clock").wire();
+        for line in [
+            format!("reset_step_clock oid=0 clock={start}"),
+            "queue_step oid=0 interval=50000 count=1000 add=0".to_owned(),
+            format!("queue_digital_out oid=1 clock={start} on_ticks=1"),
+            format!("queue_digital_out oid=1 clock={} on_ticks=0", start.wrapping_add(client.ticks(0.3))),
+        ] {
+            run(client, &line);
+        }
+        // A command that makes the host wait.
+        thread::sleep(Duration::from_millis(800));
+        let began_us = now_us();
+        run(client, "update_digital_out oid=1 value=1");
+        assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
+        thread::sleep(Duration::from_millis(500));
+        sysfs::wait_until("all steps are made", || trace.writes_to(step).len() >= 2000);
+        let edges = trace.writes_to(step);
+        let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
+        assert_eq!(rising.len(), 1000);
+        let worst = rising.iter().zip(0..).map(|(at_us, n)| (at_us - rising[0]).abs_diff(1000 * n)).max();
+        println!("steps stray by {worst:?} us");
+        assert!(worst.expect("steps") < 200, "{worst:?} us");
+        let sent = sysfs::read(format!("{MOCK}/sent"));
+        let outputs: Vec<&str> = sent.lines().filter(|line| line.starts_with("50 01 ")).collect();
+        assert_eq!(outputs, ["50 01 ff", "50 01 df", "50 01 ff"]);
+    }
+
+    #[test]
+    fn a_step_pin_on_it_is_refused_with_the_reason() {
+        let (_sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+        let program = Program::start();
+        let client = &mut program.connect();
+        for (step, dir) in [(expander.pin(0), "lab/gpio1".to_owned()), ("lab/gpio0".to_owned(), expander.pin(1))] {
+            let config =
+                format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100");
+            assert_eq!(refusal(client, 1, &[config]), "Unable to open out GPIO chip line");
+        }
+        for (pin, what) in [(0, "a step pin"), (1, "a dir pin")] {
+            program.wait_for_line(&[&expander.pin(pin), what, "behind a bus", "choose a pin of the processor itself"]);
+        }
+        configure(client, 1, &[output(0, &expander.pin(0))]);
     }
 }

@@ -125,14 +125,6 @@ fn lose_guardian_by(signal: Signal, words: &str) -> u64 {
     after_ms
 }
 
-#[test]
-fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
-    let outputs = Outputs::new();
-    let log = end_by(&outputs, Signal::SIGSTOP);
-    assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
-    assert_starts_anew(&outputs);
-}
-
 /// A line that is on, without a limit (`max_duration`). Nothing else would notice lost time.
 struct Heater {
     sim: GpioSim,
@@ -277,5 +269,13 @@ mod slow {
         assert!(heater.is_on());
         group.freeze(false);
         heater.assert_stopped_in_order(program, client);
+    }
+
+    #[test]
+    fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
+        let outputs = Outputs::new();
+        let log = end_by(&outputs, Signal::SIGSTOP);
+        assert!(log.contains("the core had no heartbeat for 550 ms"), "{log}");
+        assert_starts_anew(&outputs);
     }
 }

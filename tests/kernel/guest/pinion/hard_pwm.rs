@@ -44,44 +44,6 @@ fn a_channel_is_exported_and_driven() {
     sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 
-/// A running fan or heater is neither switched off nor driven harder, not even for a moment.
-#[test]
-fn a_channel_that_runs_is_configured_anew_without_a_moment_off() {
-    let part = |(period, duty, enabled): (u64, u64, bool)| if enabled { duty as f64 / period as f64 } else { 0.0 };
-    for (before, after) in [(50_000, 50_000), (50_000, 5_000), (5_000, 50_000), (50_000, 40_000), (40_000, 50_000)] {
-        // As a former program left it, such as before an upgrade.
-        sysfs::write(format!("{CHIP}/export"), "6");
-        for (file, value) in [("period", before * 20), ("duty_cycle", before * 5), ("enable", 1)] {
-            sysfs::write(format!("{CHIP}/pwm6/{file}"), value.to_string());
-        }
-        pwm::forget();
-        let program = Program::start();
-        configure(&mut program.connect(), 1, &[config("pwmchip0/pwm6", after)]);
-        let history = pwm::history(6);
-        assert_eq!(pwm::output(6), format!("6 {} {} 1", after * 20, after * 5));
-        assert_eq!(history.is_empty(), before == after, "{history:?}");
-        assert!(history.iter().map(|state| part(*state)).all(|part| part > 0.0 && part <= 0.25), "{history:?}");
-        drop(program);
-        sysfs::write(format!("{CHIP}/unexport"), "6");
-    }
-}
-
-#[test]
-fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
-    let program = Program::start();
-    let client = &mut program.connect();
-    for pin in ["pwmchip0/pwm8", "pwmchip5/pwm0"] {
-        assert_eq!(refusal(client, 1, &[config(pin, 50_000)]), "Unable to config pwm device", "{pin}");
-        program.wait_for_line(&["Unable to config pwm device", pin]);
-    }
-    assert_eq!(refusal(client, 1, &[config("gpio0", 50_000)]), "Unable to config pwm device");
-    program.wait_for_line(&["gpiochip0 line 0 has no hardware PWM"]);
-    assert_eq!(refusal(client, 1, &[config("pwmchip0/pwm6", 0)]), "Unable to config pwm device");
-    program.wait_for_line(&["pwmchip0/pwm6", "a period of 0 ns", "choose another cycle_time"]);
-    drop(program);
-    sysfs::write(format!("{CHIP}/unexport"), "6");
-}
-
 /// From now on the chip's driver fails.
 fn fail() -> sysfs::Setting {
     sysfs::set("/sys/devices/platform/mock-pwm/fail", (Errno::EIO as i32).to_string(), "0")
@@ -94,29 +56,6 @@ fn switch_on(client: &mut Client) {
         &["config_pwm_out oid=0 pin=pwmchip0/pwm6 cycle_ticks=50000 value=16384 default_value=0 max_duration=0"],
     );
     assert_eq!(pwm::output(6), ON);
-}
-
-#[test]
-fn a_channel_that_fails_stops_the_mcu_and_is_tried_again() {
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    switch_on(client);
-    let failing = fail();
-    let at = client.clock_in(0.05).expect("the clock").wire();
-    client.send_line(&format!("queue_pwm_out oid=0 clock={at} value=8192")).expect("a session");
-    let text = shutdown_of(client);
-    program.wait_for_line(&[&text, "PWM output oid 0", "pwmchip0/pwm6: Input/output error"]);
-    thread::sleep(Duration::from_millis(300));
-    drop(failing);
-    program.wait_for_line(&["PWM output oid 0", "is at its shutdown value after all"]);
-    assert_eq!(pwm::output(6), OFF);
-    thread::sleep(Duration::from_secs(2));
-    assert!(program.is_running());
-    assert!(!program.log().contains("guardian"), "{}", program.log());
-    client.reset().expect("a reset");
-    switch_on(client);
-    drop(program);
-    sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 
 #[test]
@@ -155,6 +94,68 @@ mod slow {
         program.wait_for_line(&["is not at its shutdown value within 1000 ms", "all 1 outputs are driven"]);
         assert_eq!(pwm::output(6), OFF);
         switch_on(&mut Program::start().connect());
+        sysfs::write(format!("{CHIP}/unexport"), "6");
+    }
+
+    /// A running fan or heater is neither switched off nor driven harder, not even for a moment.
+    #[test]
+    fn a_channel_that_runs_is_configured_anew_without_a_moment_off() {
+        let part = |(period, duty, enabled): (u64, u64, bool)| if enabled { duty as f64 / period as f64 } else { 0.0 };
+        for (before, after) in [(50_000, 50_000), (50_000, 5_000), (5_000, 50_000), (50_000, 40_000), (40_000, 50_000)]
+        {
+            // As a former program left it, such as before an upgrade.
+            sysfs::write(format!("{CHIP}/export"), "6");
+            for (file, value) in [("period", before * 20), ("duty_cycle", before * 5), ("enable", 1)] {
+                sysfs::write(format!("{CHIP}/pwm6/{file}"), value.to_string());
+            }
+            pwm::forget();
+            let program = Program::start();
+            configure(&mut program.connect(), 1, &[config("pwmchip0/pwm6", after)]);
+            let history = pwm::history(6);
+            assert_eq!(pwm::output(6), format!("6 {} {} 1", after * 20, after * 5));
+            assert_eq!(history.is_empty(), before == after, "{history:?}");
+            assert!(history.iter().map(|state| part(*state)).all(|part| part > 0.0 && part <= 0.25), "{history:?}");
+            drop(program);
+            sysfs::write(format!("{CHIP}/unexport"), "6");
+        }
+    }
+
+    #[test]
+    fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
+        let program = Program::start();
+        let client = &mut program.connect();
+        for pin in ["pwmchip0/pwm8", "pwmchip5/pwm0"] {
+            assert_eq!(refusal(client, 1, &[config(pin, 50_000)]), "Unable to config pwm device", "{pin}");
+            program.wait_for_line(&["Unable to config pwm device", pin]);
+        }
+        assert_eq!(refusal(client, 1, &[config("gpio0", 50_000)]), "Unable to config pwm device");
+        program.wait_for_line(&["gpiochip0 line 0 has no hardware PWM"]);
+        assert_eq!(refusal(client, 1, &[config("pwmchip0/pwm6", 0)]), "Unable to config pwm device");
+        program.wait_for_line(&["pwmchip0/pwm6", "a period of 0 ns", "choose another cycle_time"]);
+        drop(program);
+        sysfs::write(format!("{CHIP}/unexport"), "6");
+    }
+
+    #[test]
+    fn a_channel_that_fails_stops_the_mcu_and_is_tried_again() {
+        let mut program = Program::start();
+        let client = &mut program.connect();
+        switch_on(client);
+        let failing = fail();
+        let at = client.clock_in(0.05).expect("the clock").wire();
+        client.send_line(&format!("queue_pwm_out oid=0 clock={at} value=8192")).expect("a session");
+        let text = shutdown_of(client);
+        program.wait_for_line(&[&text, "PWM output oid 0", "pwmchip0/pwm6: Input/output error"]);
+        thread::sleep(Duration::from_millis(300));
+        drop(failing);
+        program.wait_for_line(&["PWM output oid 0", "is at its shutdown value after all"]);
+        assert_eq!(pwm::output(6), OFF);
+        thread::sleep(Duration::from_secs(2));
+        assert!(program.is_running());
+        assert!(!program.log().contains("guardian"), "{}", program.log());
+        client.reset().expect("a reset");
+        switch_on(client);
+        drop(program);
         sysfs::write(format!("{CHIP}/unexport"), "6");
     }
 }

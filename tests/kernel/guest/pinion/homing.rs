@@ -63,36 +63,41 @@ fn an_axis_homes_backs_off_and_homes_again() {
     assert_eq!((homed.reason, homed.position), (HomingEnd::PastEnd, position - 300), "nobody closed the switch");
 }
 
-#[test]
-fn a_host_that_falls_silent_while_homing_stops_the_axis() {
-    let sim = GpioSim::new("lab", 8);
-    let program = Program::start();
-    let client = &mut program.connect();
-    let mut config = Config::default();
-    let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
-    let endstop = Endstop::configure(&mut config, "lab/gpio2", 1, true).expect("few objects");
-    config.apply(client).expect("a configuration that it takes");
-    let (trsync, oid) = (endstop.trsync, stepper.oid);
-    let start = client.clock_in(0.2).expect("the clock").wire();
-    let expire = start.wrapping_add(client.ticks(0.25));
-    // Ten seconds of steps, and news for a quarter of a second.
-    for line in [
-        format!("trsync_start oid={trsync} report_clock={start} report_ticks=0 expire_reason=4"),
-        format!("stepper_stop_on_trigger oid={oid} trsync_oid={trsync}"),
-        format!("trsync_set_timeout oid={trsync} clock={expire}"),
-        format!("reset_step_clock oid={oid} clock={start}"),
-        format!("queue_step oid={oid} interval=50000 count=10000 add=0"),
-    ] {
-        client.send_line(&line).expect("a session");
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_host_that_falls_silent_while_homing_stops_the_axis() {
+        let sim = GpioSim::new("lab", 8);
+        let program = Program::start();
+        let client = &mut program.connect();
+        let mut config = Config::default();
+        let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+        let endstop = Endstop::configure(&mut config, "lab/gpio2", 1, true).expect("few objects");
+        config.apply(client).expect("a configuration that it takes");
+        let (trsync, oid) = (endstop.trsync, stepper.oid);
+        let start = client.clock_in(0.2).expect("the clock").wire();
+        let expire = start.wrapping_add(client.ticks(0.25));
+        // Ten seconds of steps, and news for a quarter of a second.
+        for line in [
+            format!("trsync_start oid={trsync} report_clock={start} report_ticks=0 expire_reason=4"),
+            format!("stepper_stop_on_trigger oid={oid} trsync_oid={trsync}"),
+            format!("trsync_set_timeout oid={trsync} clock={expire}"),
+            format!("reset_step_clock oid={oid} clock={start}"),
+            format!("queue_step oid={oid} interval=50000 count=10000 add=0"),
+        ] {
+            client.send_line(&line).expect("a session");
+        }
+        let trace = Trace::start();
+        let state = client
+            .wait("trsync_state", Some(trsync), std::time::Instant::now() + Duration::from_secs(5))
+            .expect("a session")
+            .expect("a report");
+        assert_eq!(state.int("trigger_reason").expect("a reason"), 4);
+        std::thread::sleep(Duration::from_millis(20));
+        let rising = trace.writes_to(sim.kernel_number(0)).iter().filter(|write| write.level).count();
+        assert!((249..=251).contains(&rising), "{rising} steps in 250 ms");
+        assert_eq!(stepper.position(client).expect("a position").unsigned_abs(), rising as u64);
     }
-    let trace = Trace::start();
-    let state = client
-        .wait("trsync_state", Some(trsync), std::time::Instant::now() + Duration::from_secs(5))
-        .expect("a session")
-        .expect("a report");
-    assert_eq!(state.int("trigger_reason").expect("a reason"), 4);
-    std::thread::sleep(Duration::from_millis(20));
-    let rising = trace.writes_to(sim.kernel_number(0)).iter().filter(|write| write.level).count();
-    assert!((249..=251).contains(&rising), "{rising} steps in 250 ms");
-    assert_eq!(stepper.position(client).expect("a position").unsigned_abs(), rising as u64);
 }

@@ -78,43 +78,6 @@ fn what_the_kernel_says_becomes_a_status_and_the_mcu_goes_on() {
     assert_eq!(transfer(client, 0, &[], 1).0, "SUCCESS");
 }
 
-#[test]
-fn a_bus_or_an_address_that_can_not_be_had_is_named() {
-    let program = Program::start();
-    let client = &mut program.connect();
-    assert_eq!(refusal(client, 1, &device(0, "i2c.13", 0x51)), "Unable to open i2c device");
-    program.wait_for_line(&["there is no /dev/i2c-13", &bus_name(), "dtparam=i2c_arm=on"]);
-    configure(client, 1, &device(0, &bus_name(), 0x51));
-    assert_eq!(transfer(client, 0, &[0], 1).0, "SUCCESS");
-}
-
-#[test]
-fn a_slow_bus_keeps_no_step() {
-    let sim = GpioSim::builder("lab", 8).name(3, "STEP").name(5, "DIR").build();
-    let program = Program::start();
-    let client = &mut program.connect();
-    let mut config = Config::default();
-    let stepper = Stepper::configure(&mut config, "STEP", 0, "DIR", false, 100).expect("few objects");
-    let oid = config.oid().expect("few objects");
-    for line in
-        [format!("config_i2c oid={oid}"), format!("i2c_set_bus oid={oid} i2c_bus={} rate=1 address=81", bus_name())]
-    {
-        config.add(line);
-    }
-    let status = config.apply(client).expect("a configuration that it takes");
-    let mut queue = MoveQueue::new(status.move_count);
-    let profile = Profile::trapezoid(700, 4000.0, 40_000.0, 50e6).expect("a profile");
-    let _slow = sysfs::set(format!("{MOCK}/delay_ms"), "60", "0");
-    let trace = Trace::start();
-    // A display that is refreshed at the same time. The test does not wait for the answers.
-    let args = [("oid", oid.into()), ("write", [0_u8, 1][..].into()), ("read_len", 0_u8.into())];
-    client.send("i2c_transfer", &args).expect("a session");
-    queue.run(client, stepper, true, &profile, None).expect("a move");
-    assert_eq!(trace.writes_to(sim.kernel_number(3)).len(), 2 * 700);
-    assert_eq!(stepper.position(client).expect("a position"), 700);
-    assert_eq!(transfer(client, oid, &[0], 1), ("SUCCESS".into(), vec![1]));
-}
-
 /// gpio-sim has no chip that answers. `crates/firmware/src/board/soft_i2c.rs` tests the bits on the wires.
 #[test]
 fn a_software_bus_pulls_low_or_lets_go_and_never_drives_high() {
@@ -163,4 +126,46 @@ fn a_software_spi_clocks_its_bits_on_lines() {
     assert!(edges.windows(3).all(|three| three[2].at_ns - three[0].at_ns >= 20_000), "{edges:?}");
     assert_eq!(select.iter().map(|write| write.level).collect::<Vec<_>>(), [false, true]);
     assert!(select[0].at_ns < edges[0].at_ns && edges[31].at_ns < select[1].at_ns);
+}
+
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_slow_bus_keeps_no_step() {
+        let sim = GpioSim::builder("lab", 8).name(3, "STEP").name(5, "DIR").build();
+        let program = Program::start();
+        let client = &mut program.connect();
+        let mut config = Config::default();
+        let stepper = Stepper::configure(&mut config, "STEP", 0, "DIR", false, 100).expect("few objects");
+        let oid = config.oid().expect("few objects");
+        for line in
+            [format!("config_i2c oid={oid}"), format!("i2c_set_bus oid={oid} i2c_bus={} rate=1 address=81", bus_name())]
+        {
+            config.add(line);
+        }
+        let status = config.apply(client).expect("a configuration that it takes");
+        let mut queue = MoveQueue::new(status.move_count);
+        let profile = Profile::trapezoid(700, 4000.0, 40_000.0, 50e6).expect("a profile");
+        let _slow = sysfs::set(format!("{MOCK}/delay_ms"), "60", "0");
+        let trace = Trace::start();
+        // A display that is refreshed at the same time. The test does not wait for the answers.
+        let args = [("oid", oid.into()), ("write", [0_u8, 1][..].into()), ("read_len", 0_u8.into())];
+        client.send("i2c_transfer", &args).expect("a session");
+        queue.run(client, stepper, true, &profile, None).expect("a move");
+        assert_eq!(trace.writes_to(sim.kernel_number(3)).len(), 2 * 700);
+        assert_eq!(stepper.position(client).expect("a position"), 700);
+        assert_eq!(transfer(client, oid, &[0], 1), ("SUCCESS".into(), vec![1]));
+    }
+
+    #[test]
+    fn a_bus_or_an_address_that_can_not_be_had_is_named() {
+        let program = Program::start();
+        let client = &mut program.connect();
+        assert_eq!(refusal(client, 1, &device(0, "i2c.13", 0x51)), "Unable to open i2c device");
+        program.wait_for_line(&["there is no /dev/i2c-13", &bus_name(), "dtparam=i2c_arm=on"]);
+        configure(client, 1, &device(0, &bus_name(), 0x51));
+        assert_eq!(transfer(client, 0, &[0], 1).0, "SUCCESS");
+    }
 }

@@ -85,42 +85,6 @@ fn inputs_have_the_bias_that_was_asked_for() {
     }
 }
 
-/// The kernel cannot change a held line: Pinion releases it and requests it again.
-#[test]
-fn a_line_is_set_up_again_on_linux_before_5_5() {
-    let sim = GpioSim::new("lab", 8);
-    let mut program = Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL);
-    let client = &mut program.connect();
-    // An input that becomes an output, an output that becomes an input, and an output that stays an output.
-    let high = |oid, pin| format!("config_digital_out oid={oid} pin={pin} value=1 default_value=0 max_duration=0");
-    configure(
-        client,
-        5,
-        &[
-            input(0, "lab/gpio0", 0),
-            high(1, "lab/gpio0"),
-            output(2, "lab/gpio1"),
-            input(3, "lab/gpio1", 0),
-            "set_digital_out pin=lab/gpio2 value=1".to_owned(),
-            high(4, "lab/gpio2"),
-        ],
-    );
-    assert!(sim.level(0) && sim.level(2));
-    for up in [true, false, true] {
-        sim.pull(1, up);
-        assert_eq!(sees_high(client, 3), up);
-    }
-    run(client, "update_digital_out oid=4 value=0");
-    run(client, "update_digital_out oid=4 value=1");
-    assert!(sim.level(2));
-    // The guardian has the present outputs.
-    let guardian = program.guardian();
-    program.kill();
-    sysfs::wait_until("the guardian ends", || !exists(guardian));
-    program.wait_for_line(&["guardian: ", "all 2 outputs are driven"]);
-    assert!(!sim.level(0) && !sim.level(2));
-}
-
 #[test]
 fn a_line_in_use_is_refused_and_its_holder_named() {
     let sim = GpioSim::builder("lab", 8).name(4, "HEATER").hog(6, "spi0 CS1").build();
@@ -210,23 +174,6 @@ fn a_chip_that_goes_away_stops_the_mcu_and_a_restart_starts_anew() {
 }
 
 #[test]
-fn after_a_kill_a_restart_claims_the_lines() {
-    let sim = GpioSim::new("lab", 8);
-    let config = [output(0, "lab/gpio0"), input(1, "lab/gpio1", 1)];
-    let mut program = Program::start();
-    configure(&mut program.connect(), 2, &config);
-    program.kill();
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    configure(client, 2, &config);
-    run(client, "update_digital_out oid=0 value=1");
-    assert!(sim.level(0));
-    program.signal(Signal::SIGTERM);
-    assert!(program.wait().success());
-    assert_eq!(uapi::line_info(&sim.path(), 0).consumer, "");
-}
-
-#[test]
 fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
     // Every computer has names for the lines of nine chips, but not for the lines of a tenth chip.
     let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
@@ -241,4 +188,62 @@ fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
     assert!(names.iter().any(|name| name == pin), "{status}");
     assert!(status["board"].as_str().is_some_and(|board| board.contains("late (8 lines)")), "{status}");
     drop(before);
+}
+
+/// `make test-slow` has them.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn after_a_kill_a_restart_claims_the_lines() {
+        let sim = GpioSim::new("lab", 8);
+        let config = [output(0, "lab/gpio0"), input(1, "lab/gpio1", 1)];
+        let mut program = Program::start();
+        configure(&mut program.connect(), 2, &config);
+        program.kill();
+        let mut program = Program::start();
+        let client = &mut program.connect();
+        configure(client, 2, &config);
+        run(client, "update_digital_out oid=0 value=1");
+        assert!(sim.level(0));
+        program.signal(Signal::SIGTERM);
+        assert!(program.wait().success());
+        assert_eq!(uapi::line_info(&sim.path(), 0).consumer, "");
+    }
+
+    /// The kernel cannot change a held line: Pinion releases it and requests it again.
+    #[test]
+    fn a_line_is_set_up_again_on_linux_before_5_5() {
+        let sim = GpioSim::new("lab", 8);
+        let mut program = Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL);
+        let client = &mut program.connect();
+        // An input that becomes an output, an output that becomes an input, and an output that stays an output.
+        let high = |oid, pin| format!("config_digital_out oid={oid} pin={pin} value=1 default_value=0 max_duration=0");
+        configure(
+            client,
+            5,
+            &[
+                input(0, "lab/gpio0", 0),
+                high(1, "lab/gpio0"),
+                output(2, "lab/gpio1"),
+                input(3, "lab/gpio1", 0),
+                "set_digital_out pin=lab/gpio2 value=1".to_owned(),
+                high(4, "lab/gpio2"),
+            ],
+        );
+        assert!(sim.level(0) && sim.level(2));
+        for up in [true, false, true] {
+            sim.pull(1, up);
+            assert_eq!(sees_high(client, 3), up);
+        }
+        run(client, "update_digital_out oid=4 value=0");
+        run(client, "update_digital_out oid=4 value=1");
+        assert!(sim.level(2));
+        // The guardian has the present outputs.
+        let guardian = program.guardian();
+        program.kill();
+        sysfs::wait_until("the guardian ends", || !exists(guardian));
+        program.wait_for_line(&["guardian: ", "all 2 outputs are driven"]);
+        assert!(!sim.level(0) && !sim.level(2));
+    }
 }

@@ -47,21 +47,26 @@ fn a_chip_is_set_up_and_its_output_goes_off_at_a_shutdown() {
     sysfs::wait_until("the output is off", || sent() == ["53 0e 00 00 00 10"]);
 }
 
-#[test]
-fn a_silent_chip_neither_ends_the_program_nor_keeps_it_from_the_next_configuration() {
-    let mut program = Program::start();
-    let client = &mut program.connect();
-    configure(client, 1, &[output(2048)]);
-    let silent = format!("{} 1000000", Errno::ENXIO as i32);
-    let silent = sysfs::set(format!("{MOCK}/fail"), silent, "0 0");
-    run(client, "emergency_stop");
-    program.wait_for_line(&["PCA9685 has not accepted its shutdown values for 500 ms", "its outputs may be on"]);
-    // The guardian ends a program that owes an output for a second.
-    thread::sleep(Duration::from_secs(3));
-    assert!(program.is_running(), "{}", program.log());
-    assert_eq!(refusal(client, 1, &[output(0)]), "Unable to open and init PCA9685 device");
-    configure::<&str>(client, 1, &[]);
-    drop(silent);
-    configure(client, 1, &[output(4096)]);
-    assert_eq!(sent().last().map(String::as_str), Some("53 0e 00 10 00 00"));
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_silent_chip_neither_ends_the_program_nor_keeps_it_from_the_next_configuration() {
+        let mut program = Program::start();
+        let client = &mut program.connect();
+        configure(client, 1, &[output(2048)]);
+        let silent = format!("{} 1000000", Errno::ENXIO as i32);
+        let silent = sysfs::set(format!("{MOCK}/fail"), silent, "0 0");
+        run(client, "emergency_stop");
+        program.wait_for_line(&["PCA9685 has not accepted its shutdown values for 500 ms", "its outputs may be on"]);
+        // The guardian ends a program that owes an output for a second.
+        thread::sleep(Duration::from_secs(3));
+        assert!(program.is_running(), "{}", program.log());
+        assert_eq!(refusal(client, 1, &[output(0)]), "Unable to open and init PCA9685 device");
+        configure::<&str>(client, 1, &[]);
+        drop(silent);
+        configure(client, 1, &[output(4096)]);
+        assert_eq!(sent().last().map(String::as_str), Some("53 0e 00 10 00 00"));
+    }
 }

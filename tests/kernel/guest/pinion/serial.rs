@@ -60,20 +60,25 @@ fn a_message_its_echo_and_a_reply_go_over_the_port() {
     program.wait_for_line(&["TMC UART ttyS1: it receives nothing, not even its own message"]);
 }
 
-#[test]
-fn a_port_in_use_and_the_console_are_refused() {
-    let program = Program::start();
-    let client = &mut program.connect();
-    assert_eq!(refusal(client, 1, &[config("ttyS0")]), "Unable to open serial port");
-    program.wait_for_line(&["/dev/ttyS0: the kernel writes its messages to it: remove its console="]);
-    let other = Flock::lock(port(), FlockArg::LockExclusiveNonblock).expect("nobody uses it");
-    assert_eq!(refusal(client, 1, &[config("ttyS1")]), "Unable to open serial port");
-    program.wait_for_line(&["/dev/ttyS1: another program uses it: end that program"]);
-    drop(other);
-    configure(client, 1, &[config("ttyS1")]);
-    // Its lock is free again with the next configuration.
-    configure(client, 1, &[config("ttyS1")]);
-    let list = Command::new("pinion").args(["pins", "serial"]).output().expect("a program");
-    let list = String::from_utf8(list.stdout).expect("text");
-    assert!(list.contains("uart_pin: ttyS1") && list.contains("/dev/ttyS0  none: the kernel writes"), "{list}");
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_port_in_use_and_the_console_are_refused() {
+        let program = Program::start();
+        let client = &mut program.connect();
+        assert_eq!(refusal(client, 1, &[config("ttyS0")]), "Unable to open serial port");
+        program.wait_for_line(&["/dev/ttyS0: the kernel writes its messages to it: remove its console="]);
+        let other = Flock::lock(port(), FlockArg::LockExclusiveNonblock).expect("nobody uses it");
+        assert_eq!(refusal(client, 1, &[config("ttyS1")]), "Unable to open serial port");
+        program.wait_for_line(&["/dev/ttyS1: another program uses it: end that program"]);
+        drop(other);
+        configure(client, 1, &[config("ttyS1")]);
+        // Its lock is free again with the next configuration.
+        configure(client, 1, &[config("ttyS1")]);
+        let list = Command::new("pinion").args(["pins", "serial"]).output().expect("a program");
+        let list = String::from_utf8(list.stdout).expect("text");
+        assert!(list.contains("uart_pin: ttyS1") && list.contains("/dev/ttyS0  none: the kernel writes"), "{list}");
+    }
 }

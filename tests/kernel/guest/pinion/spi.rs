@@ -147,21 +147,26 @@ fn a_controller_of_one_data_line_takes_what_is_only_sent() {
     sysfs::write(format!("{MOCK}/half_duplex"), "0");
 }
 
-#[test]
-fn what_goes_wrong_names_the_device() {
-    let program = Program::start();
-    let client = &mut program.connect();
-    configure(client, 1, &plain(0, "spidev0.1", 0));
-    sysfs::write(format!("{MOCK}/fail"), format!("{} 1", Errno::EIO as i32));
-    run(client, "spi_send oid=0 data=01");
-    assert_eq!(shutdown_of(client), "Unable to issue spi ioctl");
-    program.wait_for_line(&["Unable to issue spi ioctl", "/dev/spidev0.1", "1 bytes at 4000000 Hz"]);
-    configure(client, 1, &plain(0, "spidev0.1", 0));
-    assert_eq!(transfer(client, 0, &[7]), [7]);
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
 
-    assert_eq!(refusal(client, 1, &plain(0, "spidev3.2", 0)), "Unable to open spi device");
-    program.wait_for_line(&["there is no /dev/spidev3.2", "spidev0.0, spidev0.1"]);
-    assert_eq!(refusal(client, 1, &plain(0, "spidev0.0", 4)), "Invalid spi config");
-    configure(client, 1, &plain(0, "spidev0.0", 0));
-    assert_eq!(transfer(client, 0, &[8]), [8]);
+    #[test]
+    fn what_goes_wrong_names_the_device() {
+        let program = Program::start();
+        let client = &mut program.connect();
+        configure(client, 1, &plain(0, "spidev0.1", 0));
+        sysfs::write(format!("{MOCK}/fail"), format!("{} 1", Errno::EIO as i32));
+        run(client, "spi_send oid=0 data=01");
+        assert_eq!(shutdown_of(client), "Unable to issue spi ioctl");
+        program.wait_for_line(&["Unable to issue spi ioctl", "/dev/spidev0.1", "1 bytes at 4000000 Hz"]);
+        configure(client, 1, &plain(0, "spidev0.1", 0));
+        assert_eq!(transfer(client, 0, &[7]), [7]);
+
+        assert_eq!(refusal(client, 1, &plain(0, "spidev3.2", 0)), "Unable to open spi device");
+        program.wait_for_line(&["there is no /dev/spidev3.2", "spidev0.0, spidev0.1"]);
+        assert_eq!(refusal(client, 1, &plain(0, "spidev0.0", 4)), "Invalid spi config");
+        configure(client, 1, &plain(0, "spidev0.0", 0));
+        assert_eq!(transfer(client, 0, &[8]), [8]);
+    }
 }

@@ -43,11 +43,6 @@ fn a_single_wire_is_driven_for_the_message_and_let_go_for_the_reply() {
     message_and_reply(&Program::start());
 }
 
-#[test]
-fn a_single_wire_is_let_go_on_linux_before_5_5() {
-    message_and_reply(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL));
-}
-
 fn message_and_reply(program: &Program) {
     let sim = GpioSim::new("lab", 8);
     let client = &mut program.connect();
@@ -72,5 +67,15 @@ fn message_and_reply(program: &Program) {
         let pause_ns = last.at_ns - message[message.len() - 1].at_ns;
         assert!(last.level && pause_ns > 10 * BIT_NS, "{writes:?}");
         assert!(is_output() && sim.level(WIRE));
+    }
+}
+
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_single_wire_is_let_go_on_linux_before_5_5() {
+        message_and_reply(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL));
     }
 }
