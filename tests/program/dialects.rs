@@ -128,7 +128,8 @@ fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
     until_once_more(&pinion, "host gone", || host.turn("closed"));
     checkout.change("v0.12", |sources| sources);
     host.turn("open");
-    assert!(pinion.client().dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c"));
+    let client = pinion.client();
+    assert!(client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c"), "{}", pinion.log());
 }
 
 #[test]
