@@ -119,7 +119,7 @@ endif
 
 # Fewer random cases of each property than proptest's 256, which `cargo test` alone has.
 test-programs:
-	PROPTEST_CASES=$${PROPTEST_CASES:-64} '$(CARGO)' test --locked
+	PROPTEST_CASES=$${PROPTEST_CASES:-32} '$(CARGO)' test --locked
 
 # Its lines would stand among those of the other tests.
 test-slow-drivers: DRIVERS = --flavour stock slow::

@@ -211,7 +211,9 @@ fn a_person_stops_the_far_mcu_by_a_shell() {
     let (far, near) = pair();
     near.logged("connected to");
     fs::OpenOptions::new().write(true).open(near.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
-    far.logged("FORCE_SHUTDOWN was written");
+    far.until(&format!("the stop; the near end's log:\n{}", near.log()), || {
+        far.log().contains("FORCE_SHUTDOWN was written")
+    });
 }
 
 #[test]

@@ -298,11 +298,10 @@ impl Host {
     fn heat(&mut self, printer: &mut Printer) {
         let at = self.next_heat.max(printer.rig.now()) + LEAD;
         self.next_heat = at - LEAD + HEAT_EVERY;
-        let heaters = pinion_model::SimConfig::default_printer().heaters;
         let mut powers = [0.0; 3];
-        for (n, heater) in heaters.iter().enumerate() {
+        for (n, thermistor) in printer.thermistors.iter().enumerate() {
             if let Some(fraction) = self.readings[n] {
-                let celsius = heater.thermistor().unwrap().celsius(fraction);
+                let celsius = thermistor.celsius(fraction);
                 powers[n] = ((self.targets[n] - celsius) / 10.0).clamp(0.0, 1.0);
             }
         }

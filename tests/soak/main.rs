@@ -26,7 +26,7 @@ use printer::{MS, Printer, SECOND};
 static ALLOCATOR: Counting = Counting;
 
 /// The shortest day without another request, in seconds. Every fault comes at least once, however short the day is.
-const SECONDS: u64 = 600;
+const SECONDS: u64 = 300;
 /// How long a fault may take to stop the MCU.
 const STOPS_WITHIN: u64 = 12 * SECOND;
 /// How much more memory a reset MCU may have than the first one had: what its lists have grown to.

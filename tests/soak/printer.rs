@@ -9,7 +9,7 @@ use pinion_client::messages::Messages;
 use pinion_client::serial::Received;
 use pinion_client::{Arg, Params};
 use pinion_firmware::mcu::{Dialect, DialectName, Snapshot};
-use pinion_model::{SimBoard, SimConfig, SimProbe};
+use pinion_model::{HeaterConfig, SimBoard, SimConfig, SimProbe, Thermistor};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_testbench::dice::Dice;
 use pinion_testbench::memory::{allocations, live_bytes};
@@ -47,6 +47,8 @@ pub struct Tally {
 pub struct Printer {
     pub rig: Rig,
     pub probe: SimProbe,
+    /// The thermistor of each heater.
+    pub thermistors: Vec<Thermistor>,
     pub faults: Arc<Faults>,
     pub dice: Dice,
     pub tally: Tally,
@@ -80,13 +82,14 @@ impl Printer {
     pub fn new(seed: u64, seconds: u64) -> Printer {
         let faults = Faults::none();
         let start = (1 << 32) * (1 + seed % 7) - BEFORE_WRAP;
-        let (mut probe, mut dialects) = (None, Vec::new());
+        let (mut probe, mut thermistors, mut dialects) = (None, Vec::new(), Vec::new());
         let rig = Rig::on_board(start, |bench| {
             let clock = bench.clock();
             bench.state().answer_ticks = ANSWER_TICKS;
             // The thermometer would wait for its conversion in real time.
             let printer = SimConfig::default_toml().replace("conversion_ms = 750", "conversion_ms = 0");
             let printer = SimConfig::parse(&printer, "the default printer").unwrap();
+            thermistors = printer.heaters.iter().map(HeaterConfig::thermistor).collect::<Result<_, _>>().unwrap();
             let board = SimBoard::new(printer, Arc::new(clock.clone())).unwrap();
             probe = Some(board.probe());
             let dialect = |of: &DialectName| Arc::new(Dialect::new(&FIRMWARE, &board, *of).unwrap());
@@ -97,6 +100,7 @@ impl Printer {
         Printer {
             rig,
             probe: probe.unwrap(),
+            thermistors,
             faults,
             dice,
             tally: Tally::default(),

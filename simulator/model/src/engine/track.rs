@@ -18,7 +18,7 @@ pub(crate) struct Track(Box<[AtomicU64]>);
 
 impl Track {
     pub(crate) fn new() -> Track {
-        Track((0..words(KEPT)).map(|_| AtomicU64::new(0)).collect())
+        Track(Box::new([const { AtomicU64::new(0) }; words(KEPT)]))
     }
 
     fn ring(&self) -> Ring<'_> {

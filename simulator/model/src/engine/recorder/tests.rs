@@ -38,7 +38,7 @@ impl Bench {
     /// The share of the way at each share of the time is `way`.
     fn go(&mut self, by_mm: [f64; 4], seconds: f64, way: impl Fn(f64) -> f64) {
         let from = self.values();
-        let slices = 20_000;
+        let slices = 5000;
         for n in 1..=slices {
             let share = f64::from(n) / f64::from(slices);
             let at = clock(self.at_s + seconds * share);
@@ -55,7 +55,7 @@ impl Bench {
                     }
                 }
             }
-            if n % 500 == 0 {
+            if n % 125 == 0 {
                 self.recorder.read(at);
             }
             self.places.push((at, self.values()));
