@@ -7,7 +7,7 @@ use std::io::{self, Read, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
@@ -153,9 +153,8 @@ fn a_terminal_is_for_one_host_only() {
     uptime(&mut near_one.client());
 }
 
-#[test]
-fn an_attach_that_hears_nothing_gives_the_terminal_back() {
-    let far = Pinion::simulated(&[]);
+/// `pinion attach` that has the terminal open, with pipes.
+fn attach(far: &Pinion) -> Child {
     let mut child = Command::new(pinion_path())
         .args(["attach", "-I"])
         .arg(far.link())
@@ -167,6 +166,13 @@ fn an_attach_that_hears_nothing_gives_the_terminal_back() {
     let mut sign = [0; 1];
     child.stdout.as_mut().unwrap().read_exact(&mut sign).unwrap();
     assert_eq!(sign, *b"~");
+    child
+}
+
+#[test]
+fn an_attach_that_hears_nothing_gives_the_terminal_back() {
+    let far = Pinion::simulated(&[]);
+    let mut child = attach(&far);
     // A keepalive is no host.
     let mut input = child.stdin.take().unwrap();
     input.write_all(b"~").unwrap();
@@ -211,9 +217,21 @@ fn a_person_stops_the_far_mcu_by_a_shell() {
     let (far, near) = pair();
     near.logged("connected to");
     fs::OpenOptions::new().write(true).open(near.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
-    far.until(&format!("the stop; the near end's log:\n{}", near.log()), || {
-        far.log().contains("FORCE_SHUTDOWN was written")
-    });
+    far.logged("FORCE_SHUTDOWN was written");
+}
+
+/// The computer is busy: when `pinion attach` goes on, the connection has already ended.
+#[test]
+fn a_stop_arrives_though_the_connection_ends_behind_it() {
+    let far = Pinion::simulated(&[]);
+    let mut child = attach(&far);
+    let pid = Pid::from_raw(child.id() as i32);
+    kill(pid, Signal::SIGSTOP).unwrap();
+    child.stdin.take().unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
+    drop(child.stdout.take());
+    kill(pid, Signal::SIGCONT).unwrap();
+    far.logged("FORCE_SHUTDOWN was written");
+    assert!(child.wait().unwrap().success());
 }
 
 #[test]

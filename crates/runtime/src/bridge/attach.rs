@@ -68,8 +68,13 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
             PollFd::new(wire.output.as_fd(), wire.output_events()),
             PollFd::new(wire.input.as_fd(), reads(true)),
         ];
-        // The end of the input has been seen, or the MCU does not read.
-        let count = if ends_at.is_none() && inward.has_room() { 3 } else { 2 };
+        let count = match ends_at {
+            // Its output may have hung up, which poll(2) would report all the time.
+            Some(_) => 1,
+            None if inward.has_room() => 3,
+            // The MCU does not read.
+            None => 2,
+        };
         let due = ends_at.unwrap_or_else(|| wire.due()).saturating_sub(monotonic());
         match poll(&mut fds[..count], poll_timeout(due)) {
             Ok(_) | Err(Errno::EINTR) => {}
@@ -82,9 +87,9 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
         {
             return Err(Trouble::new("Pinion has ended").of(link.display()).remedy(START));
         }
-        if output.contains(PollFlags::POLLERR) {
-            // Nobody reads any more.
-            return Ok(());
+        // Nobody reads any more. The host's last bytes may still be in the input: a stop may be among them.
+        if output.contains(PollFlags::POLLERR) && from_host.is_empty() {
+            ends_at = Some(monotonic() + FAREWELL);
         }
         if count < 3 {
             wire.forgive_silence();
