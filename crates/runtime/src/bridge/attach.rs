@@ -68,13 +68,8 @@ pub fn attach(link: &Path) -> Result<(), Trouble> {
             PollFd::new(wire.output.as_fd(), wire.output_events()),
             PollFd::new(wire.input.as_fd(), reads(true)),
         ];
-        let count = match ends_at {
-            // Its output may have hung up, which poll(2) would report all the time.
-            Some(_) => 1,
-            None if inward.has_room() => 3,
-            // The MCU does not read.
-            None => 2,
-        };
+        // The MCU does not read, or the end of the input has been seen: an output that has hung up would end each wait.
+        let count = ends_at.map_or(if inward.has_room() { 3 } else { 2 }, |_| 1);
         let due = ends_at.unwrap_or_else(|| wire.due()).saturating_sub(monotonic());
         match poll(&mut fds[..count], poll_timeout(due)) {
             Ok(_) | Err(Errno::EINTR) => {}
