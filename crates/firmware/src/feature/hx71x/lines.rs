@@ -326,7 +326,7 @@ mod tests {
     fn workers(interrupted: Option<u32>, slower: u32) -> (Shift, Watcher, Arc<Chip>) {
         let chip = Arc::new(Chip { interrupted, ..Chip::default() });
         let line = |is_clock| Arc::new(Wire { chip: chip.clone(), is_clock });
-        let step_max = if slower > 100 { Duration::from_micros(1) } else { Duration::MAX };
+        let step_max = if slower > 1 { Duration::from_micros(1) } else { Duration::MAX };
         let time: Arc<dyn TimeSource> =
             Arc::new(Slow { began: Instant::now(), factor: slower, step_max, last: Mutex::default() });
         let watcher = Watcher { sclk: line(true), time: time.clone(), watch: Arc::default() };
