@@ -3,7 +3,6 @@
 export DEBIAN_FRONTEND=noninteractive
 ROOT=/run/chroot
 inside() { chroot $ROOT /usr/bin/env PATH="$PATH" "$@" </dev/null; }
-apt-get -qq purge -y pinion-mcu pinion-sim
 # The configuration of an instance is its owner's, and stays.
 configured() { find /etc/pinion 2>/dev/null | sort; }
 not grep -q 'pinion\.toml' <(configured)

@@ -24,7 +24,7 @@ flash() {
     install -D -m 755 /bin/sleep /run/flashed/klipper.elf
     bash /share/klipper/flash-linux.sh /run/flashed
 }
-pinion doctor >/run/doctor || true
+doctor >/run/doctor
 grep 'make flash starts it' /run/doctor
 if [ -e /share/klipper/flash-linux.sh ]; then
     flash
@@ -34,7 +34,7 @@ if [ -e /share/klipper/flash-linux.sh ]; then
 fi
 mv /etc/systemd/system/klipper-mcu.service /etc/systemd/system/klipper-mcu.service.before-pinion
 systemctl daemon-reload
-pinion doctor >/run/doctor || true
+doctor >/run/doctor
 not grep 'make flash starts it' /run/doctor
 if [ -e /share/klipper/flash-linux.sh ]; then
     before=$(pid)

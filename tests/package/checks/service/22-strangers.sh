@@ -5,9 +5,7 @@ fresh
 systemctl start pinion-mcu
 CONFIG=/home/stranger/printer.cfg
 printf '[mcu host]\nserial: %s\n[tmc2209 a]\nuart_pin: host:serial/../vda\n' $LINK >$CONFIG
-# The measurement differs each time.
-advice() { { pinion doctor || true; } | sed '/^latency/,$d'; }
-advice >/run/advice-before
+doctor >/run/advice-before
 # (runuser would stay as a process of root with the same words.)
 stranger() { setpriv --reuid=stranger --regid=stranger --init-groups "$@" & }
 for name in pinion klippy.py klipper_mcu agetty; do stranger bash -c "exec -a $name sleep infinity"; done
@@ -17,7 +15,7 @@ stranger sh /home/stranger/klippy.py $CONFIG
 until_true 10 pgrep -u stranger -f klippy.py
 until_true 10 pgrep -u stranger -f klipper_mcu
 until_true 10 pgrep -u stranger -f agetty
-advice >/run/advice-after
+doctor >/run/advice-after
 grep 'are called like a Pinion or a klippy, and do not count here: ' /run/advice-after
 is "$(grep -v -e 'and do not count here: ' -e 'if one of them is yours, have a service start it' /run/advice-after)" \
     "$(cat /run/advice-before)" "doctor's advice"
@@ -88,7 +86,7 @@ not systemctl start pinion-mcu
 said | grep "$LINK leads to /dev/pts/[0-9]*, which another program serves" >/dev/null
 not grep -F $evil <(said)
 # Doctor shows where the link leads, in its own line and without the line's end. It has no command with these words.
-{ pinion doctor || true; } >/run/advice
+doctor >/run/advice
 not grep "^$evil\|^ .*sudo .*$evil\|^<0>" /run/advice
 pkill -u stranger
 wait || true
