@@ -138,7 +138,7 @@ test-all: check test test-slow test-kernel figures
 
 # The demonstration waits for heaters and motors most of the time.
 test-slow: $(if $(EMULATES),system-packages-vm)
-	'$(CARGO)' test --locked --no-run --test program --test pinion_sim
+	'$(CARGO)' test --locked --no-run --test program --test pinion_sim --test soak
 ifdef EMULATES
 	'$(CARGO)' test --locked --no-run --test kernel --test kernel_guest
 endif
@@ -146,6 +146,7 @@ endif
 
 test-slow-programs:
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::cut::
+	'$(CARGO)' test --locked --test soak -- --ignored
 	@# In real time, so that it would delay the others.
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::demonstration:: --test-threads=1
 
@@ -179,7 +180,7 @@ SECONDS ?= 86400
 # Each run has its own faults. The test prints its seed if it fails.
 SEED ?= $(shell date +%s)
 soak: system-packages-build
-	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) '$(CARGO)' test --locked --test soak -- --nocapture
+	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) '$(CARGO)' test --locked --test soak -- --ignored --nocapture
 
 MINUTES ?= 60
 # Workers of stress-ng for each kind of load.

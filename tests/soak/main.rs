@@ -342,6 +342,7 @@ fn number(name: &str, default: u64) -> u64 {
 }
 
 #[test]
+#[ignore = "slow"]
 fn a_day_of_printing_with_faults_leaks_nothing_and_loses_no_step() {
     let seconds = number("PINION_SOAK_SECONDS", SECONDS);
     let end = seconds * SECOND;

@@ -77,20 +77,20 @@ fn two_nodes_of_one_chip_are_one_chip() {
     }
 }
 
-#[test]
-fn a_line_of_another_user_is_refused_all_the_same() {
-    let sim = GpioSim::builder("lab", 8).hog(6, "spi0 CS1").build();
-    let program = Program::start();
-    let client = &mut program.connect();
-    let uses = [output(0, "lab/gpio6", 0), output(1, "lab/gpio6", 0)];
-    assert_eq!(refusal(client, 2, &uses), "Unable to open out GPIO chip line");
-    program.wait_for_line(&["line 6", "in use by \"spi0 CS1\""]);
-    assert_eq!(uapi::line_info(&sim.path(), 6).consumer, "spi0 CS1");
-}
-
 /// `make test-slow` has them.
 mod slow {
     use super::*;
+
+    #[test]
+    fn a_line_of_another_user_is_refused_all_the_same() {
+        let sim = GpioSim::builder("lab", 8).hog(6, "spi0 CS1").build();
+        let program = Program::start();
+        let client = &mut program.connect();
+        let uses = [output(0, "lab/gpio6", 0), output(1, "lab/gpio6", 0)];
+        assert_eq!(refusal(client, 2, &uses), "Unable to open out GPIO chip line");
+        program.wait_for_line(&["line 6", "in use by \"spi0 CS1\""]);
+        assert_eq!(uapi::line_info(&sim.path(), 6).consumer, "spi0 CS1");
+    }
 
     #[test]
     fn two_outputs_drive_one_line_by_turns_and_the_guardian_knows_the_last_shutdown_value() {

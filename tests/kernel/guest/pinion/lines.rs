@@ -110,31 +110,6 @@ fn a_line_in_use_is_refused_and_its_holder_named() {
 }
 
 #[test]
-fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
-    let sim = GpioSim::builder("lab", 8).name(1, "FAN").build();
-    let program = Program::start();
-    let client = &mut program.connect();
-    let chip = sim.chip_name();
-    assert_eq!(refusal(client, 1, &[output(0, "gpiochip7/gpio3")]), "GPIO chip device not found");
-    program.wait_for_line(&["there is no /dev/gpiochip7", &format!("{chip} (lab)")]);
-    let beyond = format!("{chip}/gpio8");
-    assert_eq!(refusal(client, 1, &[output(0, &beyond)]), "Unable to open out GPIO chip line");
-    assert_eq!(refusal(client, 1, &[input(0, &beyond, 0)]), "Unable to open in GPIO chip line");
-    program.wait_for_line(&[chip, "(lab) has no line 8, its lines are 0 to 7"]);
-    assert_eq!(refusal(client, 1, &[output(0, "analog1")]), "Not an output pin");
-    program.wait_for_line(&["analog1 (an ADC channel) cannot be an output"]);
-    assert_eq!(refusal(client, 1, &[input(0, "pwmchip0/pwm1", 0)]), "Not an input pin");
-    program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) cannot be an input"]);
-    assert_eq!(
-        refusal(client, 1, &["config_digital_out oid=0 pin=5000 value=0 default_value=0 max_duration=0"]),
-        "Not an output pin"
-    );
-    program.wait_for_line(&["pin number 5000 (no pin has it)"]);
-
-    configure(client, 2, &[output(0, "FAN"), input(1, "lab/gpio2", 1)]);
-}
-
-#[test]
 fn a_chip_that_goes_away_stops_the_mcu_and_a_restart_starts_anew() {
     let (kept, first, second) =
         (GpioSim::new("kept", 8), GpioSim::builder("first", 8).name(2, "FAN").build(), GpioSim::new("second", 8));
@@ -173,26 +148,51 @@ fn a_chip_that_goes_away_stops_the_mcu_and_a_restart_starts_anew() {
     assert!(program.is_running());
 }
 
-#[test]
-fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
-    // Every computer has names for the lines of nine chips, but not for the lines of a tenth chip.
-    let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
-    let program = Program::start();
-    let late = GpioSim::builder("late", 8).name(3, "LAMP").build();
-    configure(&mut program.connect(), 1, &[output(0, "LAMP")]);
-    let link = program.link().to_str().expect("a path");
-    let answer = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
-    let status: serde_json::Value = serde_json::from_slice(&answer.stdout).expect("a status");
-    let names = ["LAMP".to_owned(), "late/gpio3".to_owned(), format!("{}/gpio3", late.chip_name())];
-    let pin = status["lines"][0]["pin"].as_str().expect("a line");
-    assert!(names.iter().any(|name| name == pin), "{status}");
-    assert!(status["board"].as_str().is_some_and(|board| board.contains("late (8 lines)")), "{status}");
-    drop(before);
-}
-
 /// `make test-slow` has them.
 mod slow {
     use super::*;
+
+    #[test]
+    fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
+        // Every computer has names for the lines of nine chips, but not for the lines of a tenth chip.
+        let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
+        let program = Program::start();
+        let late = GpioSim::builder("late", 8).name(3, "LAMP").build();
+        configure(&mut program.connect(), 1, &[output(0, "LAMP")]);
+        let link = program.link().to_str().expect("a path");
+        let answer = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+        let status: serde_json::Value = serde_json::from_slice(&answer.stdout).expect("a status");
+        let names = ["LAMP".to_owned(), "late/gpio3".to_owned(), format!("{}/gpio3", late.chip_name())];
+        let pin = status["lines"][0]["pin"].as_str().expect("a line");
+        assert!(names.iter().any(|name| name == pin), "{status}");
+        assert!(status["board"].as_str().is_some_and(|board| board.contains("late (8 lines)")), "{status}");
+        drop(before);
+    }
+
+    #[test]
+    fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
+        let sim = GpioSim::builder("lab", 8).name(1, "FAN").build();
+        let program = Program::start();
+        let client = &mut program.connect();
+        let chip = sim.chip_name();
+        assert_eq!(refusal(client, 1, &[output(0, "gpiochip7/gpio3")]), "GPIO chip device not found");
+        program.wait_for_line(&["there is no /dev/gpiochip7", &format!("{chip} (lab)")]);
+        let beyond = format!("{chip}/gpio8");
+        assert_eq!(refusal(client, 1, &[output(0, &beyond)]), "Unable to open out GPIO chip line");
+        assert_eq!(refusal(client, 1, &[input(0, &beyond, 0)]), "Unable to open in GPIO chip line");
+        program.wait_for_line(&[chip, "(lab) has no line 8, its lines are 0 to 7"]);
+        assert_eq!(refusal(client, 1, &[output(0, "analog1")]), "Not an output pin");
+        program.wait_for_line(&["analog1 (an ADC channel) cannot be an output"]);
+        assert_eq!(refusal(client, 1, &[input(0, "pwmchip0/pwm1", 0)]), "Not an input pin");
+        program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) cannot be an input"]);
+        assert_eq!(
+            refusal(client, 1, &["config_digital_out oid=0 pin=5000 value=0 default_value=0 max_duration=0"]),
+            "Not an output pin"
+        );
+        program.wait_for_line(&["pin number 5000 (no pin has it)"]);
+
+        configure(client, 2, &[output(0, "FAN"), input(1, "lab/gpio2", 1)]);
+    }
 
     #[test]
     fn after_a_kill_a_restart_claims_the_lines() {

@@ -40,14 +40,19 @@ fn verdict_over_a_late_host() -> String {
     program.wait_for_line(&["the host's block came"])
 }
 
-#[test]
-fn a_stop_at_a_low_voltage_is_reported_with_the_voltage() {
-    let _firmware = Firmware::load();
-    assert!(verdict_over_a_late_host().contains("look at the host's load"));
-    sysfs::write("/sys/module/mock_firmware/parameters/throttled", UNDERVOLTAGE);
-    // The driver asks every two seconds.
-    thread::sleep(Duration::from_secs(3));
-    let verdict = verdict_over_a_late_host();
-    assert!(verdict.contains("the power supply's voltage was too low then"), "{verdict}");
-    assert!(verdict.contains("use a better power supply"), "{verdict}");
+/// `make test-slow` has it.
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_stop_at_a_low_voltage_is_reported_with_the_voltage() {
+        let _firmware = Firmware::load();
+        assert!(verdict_over_a_late_host().contains("look at the host's load"));
+        sysfs::write("/sys/module/mock_firmware/parameters/throttled", UNDERVOLTAGE);
+        // The driver asks every two seconds.
+        thread::sleep(Duration::from_secs(3));
+        let verdict = verdict_over_a_late_host();
+        assert!(verdict.contains("the power supply's voltage was too low then"), "{verdict}");
+        assert!(verdict.contains("use a better power supply"), "{verdict}");
+    }
 }
