@@ -58,7 +58,8 @@ help:
 	@echo 'make test          the tests for each change, with those on real kernel drivers in a virtual machine'
 	@echo 'make test-all      all tests (tests/README.md): the former, make check and what takes long; as root also'
 	@echo '                   the package, and with KLIPPER_DIR=~/klipper a real klippy'
-	@echo 'make test-slow     tests in which heaters and motors take their real time, and on drivers the rarer ones'
+	@echo 'make test-slow     tests in which heaters and motors take their real time, minutes of printing with faults,'
+	@echo '                   the pictures of the camera, and on drivers the rarer ones'
 	@echo 'make test-kernel   all tests on real kernel drivers, on two kernels'
 	@echo 'make figures       figures of the program in that virtual machine (docs/develop/performance.md)'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
@@ -139,6 +140,7 @@ test-all: check test test-slow test-kernel figures
 # The demonstration waits for heaters and motors most of the time.
 test-slow: $(if $(EMULATES),system-packages-vm)
 	'$(CARGO)' test --locked --no-run --test program --test pinion_sim --test soak
+	'$(CARGO)' test --locked --no-run --package pinion-camera
 ifdef EMULATES
 	'$(CARGO)' test --locked --no-run --test kernel --test kernel_guest
 endif
@@ -147,6 +149,7 @@ endif
 test-slow-programs:
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::cut::
 	'$(CARGO)' test --locked --test soak -- --ignored
+	'$(CARGO)' test --locked --package pinion-camera
 	@# In real time, so that it would delay the others.
 	'$(CARGO)' test --locked --test program --test pinion_sim -- --ignored slow::demonstration:: --test-threads=1
 
