@@ -89,64 +89,75 @@ impl<'a> GuestProgram<'a> {
         Ok(list.lines().filter_map(|line| line.strip_suffix(": test")).map(str::to_owned).collect())
     }
 
-    /// The second part of the guest's root folder: init and the programs. Their libraries are at the paths of the
-    /// computer's loader.
-    pub fn payload(&self) -> Result<Vec<u8>, String> {
-        let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
+    /// The second part of the guest's root folder: init, what the computer has, and the libraries of all programs at the
+    /// paths of the computer's loader.
+    pub fn base(&self) -> Result<Vec<u8>, String> {
         let mut archive = Archive::default();
         archive.program("/init", include_bytes!("init.sh"));
-        for (name, program) in [("guest", self.path.as_path()), ("pinion", pinion())] {
-            let copy = stripped.path().join(name);
-            process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(&copy).arg(program))?;
-            archive.copy(&format!("/bin/{name}"), &copy)?;
-        }
         for program in HOST_PROGRAMS.map(Path::new) {
             let name = program.file_name().unwrap_or_default().to_string_lossy();
             archive.copy(&format!("/bin/{name}"), program)?;
         }
-        for other in self.others {
-            archive.copy(&other.path_inside(), &other.path)?;
-        }
         if let Some(klippy) = &self.klippy {
             klippy.add_to(&mut archive)?;
         }
-        for library in libraries(&self.programs())? {
+        for library in self.libraries()? {
             let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
             archive.program(&library, &content);
         }
         Ok(archive.finish())
     }
 
-    /// Changes with everything that makes the payload.
-    pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
-        for source in [
-            include_str!("guest_program.rs"),
-            include_str!("klippy.rs"),
-            pinion_testkit::initramfs::SOURCE,
-            include_str!("init.sh"),
-        ] {
-            source.hash(hasher);
+    /// The programs under test, and those that are measured, as another archive.
+    pub fn programs(&self) -> Result<Vec<u8>, String> {
+        let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
+        let mut archive = Archive::default();
+        for (name, program) in [("guest", self.path.as_path()), ("pinion", pinion())] {
+            let copy = stripped.path().join(name);
+            process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(&copy).arg(program))?;
+            archive.copy(&format!("/bin/{name}"), &copy)?;
         }
-        let libraries = libraries(&self.programs())?;
-        let klippy = self.klippy.iter().flat_map(Klippy::files);
-        for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)).chain(klippy) {
-            let describe = |error| format!("cannot read {}: {error}", path.display());
-            let metadata = fs::metadata(path).map_err(describe)?;
-            // cargo and dpkg replace a file, so no file changes without a change of these values.
-            (path, metadata.len(), metadata.modified().map_err(describe)?).hash(hasher);
+        for other in self.others {
+            archive.copy(&other.path_inside(), &other.path)?;
         }
-        Ok(())
+        Ok(archive.finish())
     }
 
-    fn programs(&self) -> Vec<&Path> {
-        let others = self.others.iter().map(|other| other.path.as_path());
+    /// Changes with everything that makes the base.
+    pub fn hash_base(&self, hasher: &mut impl Hasher) -> Result<(), String> {
+        for source in [include_str!("klippy.rs"), include_str!("init.sh")] {
+            source.hash(hasher);
+        }
+        let libraries = self.libraries()?;
+        let klippy = self.klippy.iter().flat_map(Klippy::files);
+        hash_files(HOST_PROGRAMS.iter().map(Path::new).chain(libraries.iter().map(Path::new)).chain(klippy), hasher)
+    }
+
+    /// Changes with everything that makes the archive of programs.
+    pub fn hash_programs(&self, hasher: &mut impl Hasher) -> Result<(), String> {
+        hash_files(self.changing(), hasher)
+    }
+
+    fn changing(&self) -> impl Iterator<Item = &Path> {
+        [self.path.as_path(), pinion()].into_iter().chain(self.others.iter().map(|other| other.path.as_path()))
+    }
+
+    /// The paths that the loader finds, including the loader's own.
+    fn libraries(&self) -> Result<Vec<String>, String> {
         let klippy = self.klippy.iter().flat_map(Klippy::programs);
-        [self.path.as_path(), pinion()]
-            .into_iter()
-            .chain(HOST_PROGRAMS.map(Path::new))
-            .chain(others)
-            .chain(klippy)
-            .collect()
+        let mut libraries = Vec::new();
+        for program in self.changing().chain(HOST_PROGRAMS.iter().map(Path::new)).chain(klippy) {
+            // "name => /path (address)", or "/path (address)" for the loader.
+            let list = process::output(Command::new("ldd").arg(program))?;
+            let found = list.split_whitespace().filter(|word| word.starts_with('/'));
+            libraries.extend(found.map(str::to_owned));
+            if let Some(line) = list.lines().find(|line| line.contains("not found")) {
+                return Err(format!("{} lacks a library: {line}", program.display()));
+            }
+        }
+        libraries.sort();
+        libraries.dedup();
+        Ok(libraries)
     }
 }
 
@@ -154,19 +165,14 @@ fn pinion() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_pinion"))
 }
 
-/// The paths that the loader finds, including the loader's own.
-fn libraries(programs: &[&Path]) -> Result<Vec<String>, String> {
-    let mut libraries = Vec::new();
-    for program in programs {
-        // "name => /path (address)", or "/path (address)" for the loader.
-        let list = process::output(Command::new("ldd").arg(program))?;
-        let found = list.split_whitespace().filter(|word| word.starts_with('/'));
-        libraries.extend(found.map(str::to_owned));
-        if let Some(line) = list.lines().find(|line| line.contains("not found")) {
-            return Err(format!("{} lacks a library: {line}", program.display()));
-        }
+/// cargo and dpkg replace a file, so no file changes without a change of these values.
+fn hash_files<'a>(paths: impl Iterator<Item = &'a Path>, hasher: &mut impl Hasher) -> Result<(), String> {
+    include_str!("guest_program.rs").hash(hasher);
+    pinion_testkit::initramfs::SOURCE.hash(hasher);
+    for path in paths {
+        let describe = |error| format!("cannot read {}: {error}", path.display());
+        let metadata = fs::metadata(path).map_err(describe)?;
+        (path, metadata.len(), metadata.modified().map_err(describe)?).hash(hasher);
     }
-    libraries.sort();
-    libraries.dedup();
-    Ok(libraries)
+    Ok(())
 }

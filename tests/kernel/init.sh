@@ -26,6 +26,18 @@ mount_share() {
 	mount -t 9p -o trans=virtio,version=9p2000.L,msize=262144 tests /tests/share
 }
 
+# Unpacks the programs under test: they are in the memory of QEMU's ivshmem. The third line of its resources has the place.
+unpack_programs() {
+	for device in /sys/bus/pci/devices/*; do
+		[ "$(cat "$device/vendor" "$device/device" | tr -d '\n')" = 0x1af40x1110 ] && break
+	done
+	read -r begin end _ <<-END
+		$(sed -n 3p "$device/resource")
+	END
+	echo "programs,$begin,$((end - begin + 1))" >/sys/module/phram/parameters/phram
+	(cd / && cpio -idu </dev/mtd0ro)
+}
+
 # Writes one byte, in octal, to a port.
 out() {
 	printf "\\$2" | dd of=/dev/port bs=1 seek=$(($1)) count=1 2>/dev/null
@@ -53,6 +65,7 @@ run_test() {
 
 if [ -n "$GUEST_SHELL" ]; then
 	mount_share
+	unpack_programs
 	echo "Linux $(uname -rv)"
 	echo "The tests: guest --list, guest NAME --nocapture. Ctrl-A X ends the guest."
 	setsid cttyhack sh -l
@@ -68,6 +81,7 @@ sleep 10
 out 0x505 001
 # This driver lists the computer's files when it is loaded, so it must not be loaded earlier.
 insmod /tests/plan.ko
+unpack_programs
 # Each read of this file begins at the start.
 cat /sys/firmware/qemu_fw_cfg/by_name/opt/pinion/plan/raw >/tmp/plan
 mkdir -p /tmp/tests/output

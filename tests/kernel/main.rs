@@ -10,6 +10,7 @@ mod emulator;
 mod guest_program;
 mod klippy;
 mod options;
+mod programs;
 mod report;
 mod snapshot;
 mod table;
@@ -26,6 +27,7 @@ use guest_program::GuestProgram;
 use options::Options;
 use pinion_testkit::cache::Cache;
 use pinion_testkit::kernel::{Flavour, Kernel, Offers};
+use programs::Programs;
 use report::Report;
 use snapshot::Snapshot;
 use vm::Run;
@@ -128,7 +130,7 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
     let cache = Cache::open()?;
     let flavours: Vec<Flavour> =
         Flavour::ALL.into_iter().filter(|flavour| runs.iter().any(|run| run.flavour == *flavour)).collect();
-    let snapshots = {
+    let (programs, snapshots) = {
         let _lock = cache.lock()?;
         let offers = Offers::ask(&cache)?;
         let mut kernels = Vec::new();
@@ -137,7 +139,8 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
             println!("{} is Linux {}", flavour.name(), kernel.release);
             kernels.push(kernel);
         }
-        at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?
+        let programs = Programs::prepare(program, &cache)?;
+        (programs, at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?)
     };
     // The slower kernel first.
     let order: Vec<&Run<'_>> = runs.iter().rev().collect();
@@ -145,7 +148,7 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
     // A VM emulates one processor.
     at_once(&order, processors(), |run| {
         let index = flavours.iter().position(|flavour| *flavour == run.flavour).expect("that of a run");
-        run.perform(&snapshots[index], &cache, &report)
+        run.perform(&snapshots[index], &programs, &cache, &report)
     })
     .map(drop)
 }
@@ -202,10 +205,10 @@ fn shell(options: &Options, program: &GuestProgram<'_>) -> Result<bool, String> 
     pinion_testkit::tools::ensure()?;
     let cache = Cache::open()?;
     let flavour = options.flavour.unwrap_or(Flavour::Stock);
-    let kernel = {
+    let (programs, kernel) = {
         let _lock = cache.lock()?;
-        Kernel::prepare(flavour, &Offers::ask(&cache)?, &cache)?
+        (Programs::prepare(program, &cache)?, Kernel::prepare(flavour, &Offers::ask(&cache)?, &cache)?)
     };
-    vm::shell(&kernel, &program.payload()?, &cache)?;
+    vm::shell(&kernel, &program.base()?, &programs, &cache)?;
     Ok(true)
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A file with a VM that has booted and loaded its modules. Tests continue from there. An emulated boot takes longer
-//! than a dozen tests.
+//! than a dozen tests. The programs under test come later (`programs.rs`).
 
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -22,7 +22,7 @@ const PREFIX: &str = "booted-";
 pub struct Snapshot(File);
 
 impl Snapshot {
-    /// Boots the kernel with the program, unless the snapshot exists. The caller has the cache's lock.
+    /// Boots the kernel, unless the snapshot exists. The caller has the cache's lock.
     pub fn prepare(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache) -> Result<Snapshot, String> {
         let folder = kernel.folder();
         let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
@@ -46,7 +46,7 @@ impl Snapshot {
 fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path) -> Result<(), String> {
     let folder = cache.run_folder()?;
     let file = File::create(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
-    let mut emulator = Emulator::start(vm::booting(kernel, &program.payload()?, folder.path())?, folder.path())?;
+    let mut emulator = Emulator::start(vm::booting(kernel, &program.base()?, folder.path())?, folder.path())?;
     // init stops the VM when the VM is ready for tests.
     emulator.wait_until(|status| status == "guest-panicked")?;
     emulator.ask(json!({"execute": "migrate-set-parameters", "arguments": {"max-bandwidth": 1_u64 << 40}}))?;
@@ -65,9 +65,11 @@ fn key(kernel: &Kernel, program: &GuestProgram<'_>) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     process::output(Command::new(vm::EMULATOR).arg("--version"))?.hash(&mut hasher);
     kernel.folder().hash(&mut hasher);
-    for source in [include_str!("vm.rs"), include_str!("snapshot.rs"), include_str!("emulator.rs")] {
+    for source in
+        [include_str!("vm.rs"), include_str!("snapshot.rs"), include_str!("emulator.rs"), include_str!("programs.rs")]
+    {
         source.hash(&mut hasher);
     }
-    program.hash_files(&mut hasher)?;
+    program.hash_base(&mut hasher)?;
     Ok(hasher.finish())
 }

@@ -14,6 +14,7 @@ use serde_json::json;
 use super::cache_lines::CacheLines;
 use super::emulator::Emulator;
 use super::guest_program::OtherProgram;
+use super::programs::{self, Programs};
 use super::report::{Outcome, Report};
 use super::snapshot::Snapshot;
 use pinion_testkit::cache::Cache;
@@ -77,7 +78,13 @@ impl Run<'_> {
 
     /// Runs the tests and reports them. An error is a failure of the suite. An error of the guest counts for the tests
     /// that it left out.
-    pub fn perform(&self, snapshot: &Snapshot, cache: &Cache, report: &Mutex<&mut Report>) -> Result<(), String> {
+    pub fn perform(
+        &self,
+        snapshot: &Snapshot,
+        programs: &Programs,
+        cache: &Cache,
+        report: &Mutex<&mut Report>,
+    ) -> Result<(), String> {
         let folder = cache.run_folder()?;
         let folder = folder.path();
         let plan = folder.join("plan");
@@ -95,6 +102,7 @@ impl Run<'_> {
         }
         let mut emulator = Emulator::start(vm, folder)?;
         emulator.wait_until(|status| status != "inmigrate")?;
+        programs.put_into(folder)?;
         emulator.ask(json!({"execute": "cont"}))?;
 
         let cause = follow(&mut emulator, SECOND * (TEST_S + self.print_seconds))?;
@@ -202,21 +210,22 @@ fn follow(emulator: &mut Emulator, silence_max: Duration) -> Result<String, Stri
 }
 
 /// The VM for a snapshot.
-pub fn booting(kernel: &Kernel, payload: &[u8], folder: &Path) -> Result<Command, String> {
+pub fn booting(kernel: &Kernel, base: &[u8], folder: &Path) -> Result<Command, String> {
     let mut vm = vm(folder)?;
     vm.args(TIME);
     // Every run must start, and continue, with the same numbers.
-    boot(&mut vm, kernel, payload, folder, "nokaslr norandmaps random.trust_cpu=on")?;
+    boot(&mut vm, kernel, base, folder, "nokaslr norandmaps random.trust_cpu=on")?;
     Ok(vm)
 }
 
 /// A shell in the guest, on this terminal.
-pub fn shell(kernel: &Kernel, payload: &[u8], cache: &Cache) -> Result<(), String> {
+pub fn shell(kernel: &Kernel, base: &[u8], programs: &Programs, cache: &Cache) -> Result<(), String> {
     let folder = cache.run_folder()?;
     let folder = folder.path();
     let mut vm = vm(folder)?;
+    programs.put_into(folder)?;
     eprintln!("/tests/share in the guest is {}", folder.join("share").display());
-    boot(&mut vm, kernel, payload, folder, "GUEST_SHELL=1")?;
+    boot(&mut vm, kernel, base, folder, "GUEST_SHELL=1")?;
     vm.args(["-smp", "2", "-serial", "mon:stdio"]);
     vm.status().map(drop).map_err(|error| format!("cannot start the emulator: {error}"))
 }
@@ -229,15 +238,16 @@ fn vm(folder: &Path) -> Result<Command, String> {
     vm.args(["-accel", "tcg", "-cpu", PROCESSOR, "-m", "512", "-nodefaults", "-display", "none", "-no-reboot"])
         .args(["-device", "isa-debug-exit,iobase=0xf4,iosize=0x04", "-device", "pvpanic", "-action", "panic=pause"])
         .arg("-virtfs")
-        .arg(format!("local,path={},mount_tag=tests,security_model=none", share.display()));
+        .arg(format!("local,path={},mount_tag=tests,security_model=none", share.display()))
+        .args(programs::device(folder)?);
     Ok(vm)
 }
 
-fn boot(vm: &mut Command, kernel: &Kernel, payload: &[u8], folder: &Path, parameters: &str) -> Result<(), String> {
+fn boot(vm: &mut Command, kernel: &Kernel, base: &[u8], folder: &Path, parameters: &str) -> Result<(), String> {
     let initramfs = folder.join("initramfs");
     let mut archives =
         fs::read(&kernel.initramfs).map_err(|error| format!("cannot read {}: {error}", kernel.initramfs.display()))?;
-    archives.extend_from_slice(payload);
+    archives.extend_from_slice(base);
     fs::write(&initramfs, archives).map_err(|error| format!("cannot write {}: {error}", initramfs.display()))?;
     vm.arg("-kernel")
         .arg(&kernel.vmlinux)

@@ -67,10 +67,11 @@ impl FromStr for Flavour {
 }
 
 /// Loaded in this order, with options. Dependencies come before them.
-const MODULES: [(&str, &str); 18] = [
+const MODULES: [(&str, &str); 19] = [
     ("virtio_pci", ""),
     ("9pnet_virtio", ""),
     ("9p", ""),
+    ("phram", ""),
     ("gpio-sim", ""),
     ("iio_dummy", ""),
     ("iio_dummy_evgen", ""),
@@ -96,12 +97,14 @@ const PLAN_READER: &str = "qemu_fw_cfg";
 const FIRMWARE: &str = "mock_firmware";
 
 /// The parts of an image package with these modules.
-const IMAGE_PARTS: [&str; 30] = [
+const IMAGE_PARTS: [&str; 32] = [
     "*/modules.builtin*",
     // The last parts are for the system that `tests/package` boots from a disk.
     "*/drivers/firmware/qemu_fw_cfg.ko",
     "*/drivers/i2c/*",
     "*/drivers/iio/*",
+    "*/drivers/mtd/devices/phram.ko",
+    "*/drivers/mtd/mtd.ko",
     "*/net/can/*",
     "*/drivers/virtio/*",
     "*/drivers/w1/*",
