@@ -4,6 +4,7 @@
 
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hasher};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use super::guest_program::GuestProgram;
@@ -40,7 +41,7 @@ impl Programs {
     /// Puts them into the memory of the VM of this folder. It is empty in a snapshot, which a VM reads first.
     pub fn put_into(&self, folder: &Path) -> Result<(), String> {
         let path = memory(folder);
-        let write = || std::os::unix::fs::FileExt::write_all_at(&File::options().write(true).open(&path)?, &self.0, 0);
+        let write = || File::options().write(true).open(&path)?.write_all_at(&self.0, 0);
         write().map_err(|error| format!("cannot write {}: {error}", path.display()))
     }
 }
