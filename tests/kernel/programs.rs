@@ -8,10 +8,8 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use super::guest_program::GuestProgram;
-use pinion_testkit::cache::Cache;
-use pinion_testkit::kernel::remove_others;
+use pinion_testkit::cache::{self, Cache};
 
-const PREFIX: &str = "programs-";
 /// A power of two, as any memory of a PCI device. It is the same in every VM of a snapshot.
 const SIZE: u64 = 128 << 20;
 
@@ -22,15 +20,9 @@ impl Programs {
     pub fn prepare(program: &GuestProgram<'_>, cache: &Cache) -> Result<Programs, String> {
         let mut hasher = DefaultHasher::new();
         program.hash_programs(&mut hasher)?;
-        let path = cache.root().join(format!("{PREFIX}{:016x}", hasher.finish()));
-        if !path.exists() {
-            remove_others(cache.root(), PREFIX, &path)?;
-            let partial = path.with_extension("partial");
-            let archive = program.programs()?;
-            fs::write(&partial, archive)
-                .and_then(|()| fs::rename(&partial, &path))
-                .map_err(|error| format!("cannot write {}: {error}", partial.display()))?;
-        }
+        let path = cache::made(cache.root(), "programs-", hasher.finish(), |path| {
+            fs::write(path, program.programs()?).map_err(|error| format!("cannot write {}: {error}", path.display()))
+        })?;
         let archive = fs::read(&path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
         match archive.len() as u64 {
             size if size > SIZE => Err(format!("the programs have {size} bytes, and the VM's device has {SIZE}")),

@@ -2,7 +2,7 @@
 //! A file with a VM that has booted and loaded its modules. Tests continue from there. An emulated boot takes longer
 //! than a dozen tests. The programs under test come later (`programs.rs`).
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::os::fd::AsRawFd;
 use std::path::Path;
@@ -13,26 +13,19 @@ use serde_json::json;
 use super::emulator::Emulator;
 use super::guest_program::GuestProgram;
 use super::vm;
-use pinion_testkit::cache::Cache;
+use pinion_testkit::cache::{self, Cache};
 use pinion_testkit::kernel::Kernel;
 use pinion_testkit::process;
-
-const PREFIX: &str = "booted-";
 
 pub struct Snapshot(File);
 
 impl Snapshot {
     /// Boots the kernel, unless the snapshot exists. The caller has the cache's lock.
     pub fn prepare(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache) -> Result<Snapshot, String> {
-        let folder = kernel.folder();
-        let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
-        if !path.exists() {
+        let path = cache::made(kernel.folder(), "booted-", key(kernel, program)?, |path| {
             eprintln!("booting Linux {}", kernel.release);
-            pinion_testkit::kernel::remove_others(folder, PREFIX, &path)?;
-            let partial = path.with_extension("partial");
-            make(kernel, program, cache, &partial)?;
-            fs::rename(&partial, &path).map_err(|error| format!("cannot rename {}: {error}", partial.display()))?;
-        }
+            make(kernel, program, cache, path)
+        })?;
         File::open(&path).map(Snapshot).map_err(|error| format!("cannot read {}: {error}", path.display()))
     }
 

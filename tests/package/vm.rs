@@ -10,8 +10,8 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use pinion_testkit::cache::Cache;
-use pinion_testkit::kernel::{Flavour, Kernel, Offers, remove_others};
+use pinion_testkit::cache::{self, Cache};
+use pinion_testkit::kernel::{Flavour, Kernel, Offers};
 use pinion_testkit::{process, tools};
 
 /// Longest duration of a script without a print, by the guest's clock.
@@ -49,24 +49,19 @@ impl Root {
         let offers = Offers::ask(cache)?;
         let kernel = Kernel::prepare(Flavour::Stock, &offers, cache)?;
         let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
-        let folder = cache.root().join(format!("system-{:016x}", key(&kernel)));
-        if !folder.exists() {
+        let folder = cache::made(cache.root(), "system-", key(&kernel), |folder| {
             eprintln!("making a Debian 12 with Linux {}", kernel.release);
-            remove_others(cache.root(), "system-", &folder)?;
-            let partial = folder.with_extension("partial");
-            let _ = fs::remove_dir_all(&partial);
-            fs::create_dir_all(&partial).map_err(|error| format!("{}: {error}", partial.display()))?;
+            fs::create_dir(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
             let tree = kernel.folder().with_file_name("tree");
             process::run(
                 Command::new("sh")
                     .arg(here.join("root.sh"))
-                    .args([&partial, &tree, &kernel.initramfs])
+                    .args([folder, &tree, &kernel.initramfs])
                     .arg(&kernel.release)
                     .arg(&here)
                     .arg(offers.sources()),
-            )?;
-            fs::rename(&partial, &folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        }
+            )
+        })?;
         Ok(Root { kernel: kernel.vmlinux, folder })
     }
 }

@@ -10,7 +10,7 @@ use std::process::Command;
 
 use super::board::{BOARDS, Board};
 use pinion_testkit::apt::{self, Apt};
-use pinion_testkit::cache::Cache;
+use pinion_testkit::cache::{self, Cache};
 use pinion_testkit::process;
 
 const BUSYBOX: &str = "busybox-static";
@@ -168,22 +168,16 @@ impl Packages {
 
     /// The folder below `root` where they are unpacked, downloaded if necessary.
     fn unpacked(&self, apt: &Apt, root: &Path, what: &str) -> Result<PathBuf, String> {
-        let folder = root.join(format!("sysroot-{:016x}", self.key()));
-        if !folder.exists() {
+        cache::made(root, "sysroot-", self.key(), |folder| {
             eprintln!("fetching {what}, {} packages", self.files.len());
-            remove_others(root, &folder)?;
-            let partial = folder.with_extension("partial");
-            self.unpack(apt, &partial)?;
-            fs::rename(&partial, &folder).map_err(|error| describe("rename", &partial, &error))?;
-        }
-        Ok(folder)
+            self.unpack(apt, folder)
+        })
     }
 
     fn unpack(&self, apt: &Apt, folder: &Path) -> Result<(), String> {
         let archives = folder.with_extension("archives");
         for path in [folder, &archives] {
-            remove(path)?;
-            fs::create_dir_all(path).map_err(|error| describe("create", path, &error))?;
+            fs::create_dir(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
         }
         if let Some(whole) = self.whole {
             process::run(
@@ -211,29 +205,6 @@ impl Packages {
                 &words,
             )?;
         }
-        remove(&archives)
+        cache::remove(&archives)
     }
-}
-
-/// Removes what earlier versions left.
-fn remove_others(root: &Path, keep: &Path) -> Result<(), String> {
-    let entries = fs::read_dir(root).map_err(|error| describe("read", root, &error))?;
-    for entry in entries {
-        let entry = entry.map_err(|error| describe("read", root, &error))?;
-        if entry.path() != keep && entry.file_name().to_string_lossy().starts_with("sysroot-") {
-            remove(&entry.path())?;
-        }
-    }
-    Ok(())
-}
-
-fn remove(folder: &Path) -> Result<(), String> {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(describe("remove", folder, &error)),
-        _ => Ok(()),
-    }
-}
-
-fn describe(action: &str, path: &Path, error: &std::io::Error) -> String {
-    format!("cannot {action} {}: {error}", path.display())
 }

@@ -3,10 +3,13 @@
 
 use std::env;
 use std::fs::{self, File};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::{Flock, FlockArg};
 use tempfile::TempDir;
+
+use super::describe;
 
 /// `$PINION_VM_CACHE`, or `vm` in cargo's target folder.
 pub struct Cache {
@@ -44,6 +47,45 @@ impl Cache {
     pub fn run_folder(&self) -> Result<TempDir, String> {
         tempfile::tempdir_in(self.root.join("runs"))
             .map_err(|error| format!("cannot create a folder for the run: {error}"))
+    }
+}
+
+/// The file or folder `prefix` with this key. If it is not there, `make` gets the path to make it at; the others with this
+/// prefix, also what a run did not finish, are removed first. The caller has the cache's lock.
+pub fn made(
+    folder: &Path,
+    prefix: &str,
+    key: u64,
+    make: impl FnOnce(&Path) -> Result<(), String>,
+) -> Result<PathBuf, String> {
+    let path = folder.join(format!("{prefix}{key:016x}"));
+    if !path.exists() {
+        remove_others(folder, prefix, &path)?;
+        let partial = path.with_extension("partial");
+        make(&partial)?;
+        fs::rename(&partial, &path).map_err(|error| describe("rename", &partial, &error))?;
+    }
+    Ok(path)
+}
+
+/// Removes the files and folders of earlier versions.
+pub(super) fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
+    let entries = fs::read_dir(folder).map_err(|error| describe("read", folder, &error))?;
+    for entry in entries {
+        let entry = entry.map_err(|error| describe("read", folder, &error))?;
+        if entry.path() != keep && entry.file_name().to_string_lossy().starts_with(prefix) {
+            remove(&entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+/// Removes a file or a whole folder, if it exists.
+pub fn remove(path: &Path) -> Result<(), String> {
+    let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+    match removed {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(describe("remove", path, &error)),
+        _ => Ok(()),
     }
 }
 

@@ -13,7 +13,7 @@ use std::process::Command;
 use std::str::FromStr;
 
 use super::apt::Apt;
-use super::cache::Cache;
+use super::cache::{self, Cache, remove};
 use super::initramfs::Archive;
 use super::{describe, process, tools};
 
@@ -174,13 +174,12 @@ impl Kernel {
         let version = offers.version(&release)?;
         let of_version = cache.root().join(format!("linux-{version}"));
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("modules");
-        let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
-        if !folder.exists() {
+        create(&of_version)?;
+        let folder = cache::made(&of_version, &format!("{}-", flavour.name()), key(&sources)?, |folder| {
             eprintln!("building Linux {release}, version {version}");
-            build(&offers.apt, &release, &of_version.join("tree"), &sources, &folder)?;
-            remove_others(cache.root(), "linux-", &of_version)?;
-            remove_others(&of_version, &format!("{}-", flavour.name()), &folder)?;
-        }
+            build(&offers.apt, &release, &of_version.join("tree"), &sources, folder)?;
+            cache::remove_others(cache.root(), "linux-", &of_version)
+        })?;
         Ok(Kernel { release, vmlinux: folder.join("vmlinux"), initramfs: folder.join("initramfs") })
     }
 }
@@ -296,9 +295,7 @@ fn build(apt: &Apt, release: &str, tree: &Path, sources: &Path, folder: &Path) -
     tools::install(&[(&packages.compiler, &packages.compiler)])?;
     unpack(apt, &packages, tree)?;
 
-    let partial = folder.with_extension("partial");
-    remove(&partial)?;
-    create(&partial)?;
+    create(folder)?;
     // The kernel's makefiles refuse a path with a space or a colon.
     let elsewhere = match path_str(tree)?.contains([' ', ':']) {
         true => {
@@ -311,7 +308,7 @@ fn build(apt: &Apt, release: &str, tree: &Path, sources: &Path, folder: &Path) -
             process::run(Command::new("cp").arg("-a").arg(tree.join("usr")).arg(elsewhere.path()))?;
             (elsewhere.path().join("usr/src"), elsewhere.path().join("modules"))
         }
-        None => (tree.join("usr/src"), partial.join("modules")),
+        None => (tree.join("usr/src"), folder.join("modules")),
     };
     copy_files(sources, &modules)?;
     copy_files(&tree.join("upstream"), &modules.join("upstream"))?;
@@ -327,11 +324,10 @@ fn build(apt: &Apt, release: &str, tree: &Path, sources: &Path, folder: &Path) -
     )?;
 
     let image = tree.join("lib/modules").join(release);
-    archive_modules(&image, &modules, tree, &partial.join("initramfs"))?;
+    archive_modules(&image, &modules, tree, &folder.join("initramfs"))?;
     let vmlinuz = tree.join(format!("boot/vmlinuz-{release}"));
-    extract_vmlinux(&vmlinuz, &partial.join("vmlinux"))?;
-    remove(&modules)?;
-    fs::rename(&partial, folder).map_err(|error| describe("rename", &partial, &error))
+    extract_vmlinux(&vmlinuz, &folder.join("vmlinux"))?;
+    remove(&modules)
 }
 
 /// Downloads and unpacks the parts that the tree lacks. Flavors share most parts.
@@ -524,14 +520,6 @@ fn module_name(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().replace('-', "_")
 }
 
-/// Removes the files of earlier versions.
-pub fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
-    entries(folder)?
-        .iter()
-        .filter(|path| *path != keep && file_name(path).starts_with(prefix))
-        .try_for_each(|path| remove(path))
-}
-
 fn entries(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let list = || -> io::Result<Vec<PathBuf>> { fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect() };
     let mut paths = list().map_err(|error| describe("read", folder, &error))?;
@@ -565,13 +553,4 @@ fn copy_files(from: &Path, to: &Path) -> Result<(), String> {
         fs::copy(&path, to.join(file_name(&path))).map_err(|error| describe("copy", &path, &error))?;
     }
     Ok(())
-}
-
-/// Removes a file or a whole folder, if it exists.
-fn remove(path: &Path) -> Result<(), String> {
-    let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
-    match removed {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(describe("remove", path, &error)),
-        _ => Ok(()),
-    }
 }
