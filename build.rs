@@ -47,11 +47,11 @@ const BORDER: u32 = 0x1_0000;
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-env-changed=CARGO_ENCODED_RUSTFLAGS");
+    let script = Path::new(&env::var_os("OUT_DIR").expect("cargo names it")).join("commands.ld");
+    fs::write(&script, [".text", ".rodata"].map(section).concat()).expect("cargo has made the folder");
     // A linker of the user's choice may not know this. Then the program takes more memory.
     let flags = env::var("CARGO_ENCODED_RUSTFLAGS").unwrap_or_default();
     if !["fuse-ld", "linker"].iter().any(|choice| flags.contains(choice)) {
-        let script = Path::new(&env::var_os("OUT_DIR").expect("cargo names it")).join("commands.ld");
-        fs::write(&script, [".text", ".rodata"].map(section).concat()).expect("cargo has made the folder");
         println!("cargo::rustc-link-arg-bin=pinion=-Wl,-T,{}", script.display());
     }
 }
