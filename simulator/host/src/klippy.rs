@@ -552,10 +552,6 @@ fn no_start(folder: &Path, ended: bool) -> Trouble {
         let said = std::fs::read_to_string(folder.join(name)).unwrap_or_default();
         said.lines().rev().find(|line| !line.trim().is_empty()).map(str::to_owned)
     };
-    if !ended {
-        let cause = format!("klippy opens no API within {} s", START.as_secs());
-        return Trouble::new(cause).remedy(format!("read {}", folder.join("klippy.log").display()));
-    }
     let (file, last) = match (last_of(OUTPUT), last_of("klippy.log")) {
         (Some(last), _) => (OUTPUT, last),
         (None, last) => ("klippy.log", last.unwrap_or_else(|| "it says nothing".into())),
@@ -566,7 +562,9 @@ fn no_start(folder: &Path, ended: bool) -> Trouble {
     } else {
         format!("read {}", file.display())
     };
-    Trouble::new(format!("klippy does not start: {last}")).remedy(remedy)
+    // Threads of a klippy whose main thread has failed may keep it alive.
+    let what = if ended { "does not start".into() } else { format!("opens no API within {} s", START.as_secs()) };
+    Trouble::new(format!("klippy {what}: {last}")).remedy(remedy)
 }
 
 impl<W> Host<W> {
@@ -603,14 +601,16 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let said = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
         let reason = |ended| no_start(folder.path(), ended).to_string().replace(folder.path().to_str().unwrap(), "F");
-        assert_eq!(reason(false), "klippy opens no API within 60 s: read F/klippy.log");
         assert_eq!(reason(true), "klippy does not start: it says nothing: read F/klippy.log");
         said("klippy.log", "Starting Klippy...\n");
+        assert_eq!(reason(false), "klippy opens no API within 60 s: Starting Klippy...: read F/klippy.log");
         said("klippy.out", "Traceback\nModuleNotFoundError: No module named 'greenlet'\n");
         let text = reason(true);
         assert!(text.starts_with("klippy does not start: ModuleNotFoundError: No module named 'greenlet'"), "{text}");
         assert!(text.contains("--python"), "{text}");
         said("klippy.out", "Traceback\nOSError: cannot find chelper.so\n");
         assert_eq!(reason(true), "klippy does not start: OSError: cannot find chelper.so: read F/klippy.out");
+        let text = reason(false);
+        assert_eq!(text, "klippy opens no API within 60 s: OSError: cannot find chelper.so: read F/klippy.out");
     }
 }
