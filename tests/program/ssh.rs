@@ -34,7 +34,7 @@ fn fake_ssh(folder: &Path, before: &str) -> PathBuf {
 }
 
 /// `pinion link` to a Pinion of this computer.
-fn near(remote: &Path, before: &str) -> Pinion {
+pub fn near(remote: &Path, before: &str) -> Pinion {
     let folder = tempfile::tempdir().unwrap();
     let ssh = fake_ssh(folder.path(), before);
     let link = ["link", "pi@toolhead", "--ssh", ssh.to_str().unwrap(), "--remote", remote.to_str().unwrap()];

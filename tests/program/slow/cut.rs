@@ -2,17 +2,21 @@
 //! The wire is cut, with outputs on: the MCU without its host, and with the next host. (On a CAN bus:
 //! `tests/kernel/guest/pinion/can.rs`.)
 
+use std::fs::File;
+use std::io::Write;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
+use pinion_protocol::block::{Sequence, frame};
 use serde_json::Value;
 
 use crate::links::{client, plug_in, plugged, pull_out};
 use crate::process::{Pinion, WAIT_MAX};
-use crate::ssh::{attached, pair};
+use crate::search::search_of;
+use crate::ssh::{attached, near, pair};
 use crate::status::{line, status};
 
 /// When the motors start, from the configuration on: a busy computer also has their steps queued by then.
@@ -191,19 +195,47 @@ fn a_serial_line_on_which_nothing_comes_any_more() {
     });
 }
 
+/// An SSH that will be killed.
+fn killed((mcu, near, host): (Pinion, Pinion, Client)) -> Wire {
+    let cut = |mcu: &Pinion, host: Client| -> Whole {
+        let [pid] = attached(&mcu.link())[..] else { panic!("no attach, or several") };
+        kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
+        drop(host);
+        Box::new(move |_| next_over(&near))
+    };
+    Wire { mcu, host, cut: Box::new(cut), verdict: "the host was gone from SSH" }
+}
+
 #[test]
 #[ignore = "slow"]
 fn an_ssh_that_is_killed() {
-    is_cut(|| {
-        let (mcu, near, host) = over_ssh();
-        let cut = |mcu: &Pinion, host: Client| -> Whole {
-            let [pid] = attached(&mcu.link())[..] else { panic!("no attach, or several") };
-            kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
-            drop(host);
-            Box::new(move |_| next_over(&near))
-        };
-        Wire { mcu, host, cut: Box::new(cut), verdict: "the host was gone from SSH" }
-    });
+    is_cut(|| killed(over_ssh()));
+}
+
+/// A busy computer finds out who the host is when the host has its dictionary.
+#[test]
+#[ignore = "slow"]
+fn an_ssh_that_is_found_late_and_killed() {
+    let start = || {
+        let mcu = Pinion::simulated(&[]);
+        let search = Pid::from_raw(search_of(mcu.pid()).unwrap().cast_signed());
+        kill(search, Signal::SIGSTOP).unwrap();
+        let near = near(&mcu.link(), "");
+        near.logged("serving on");
+        // As klippy does, and the tests' client does not, it waits for an answer before it opens the terminal anew.
+        let mut first = File::options().read(true).write(true).open(near.link()).unwrap();
+        let mut question = Vec::new();
+        // identify offset=0 count=40
+        frame(&[1, 0, 40], Sequence::default(), &mut question);
+        first.write_all(&question).unwrap();
+        mcu.logged("the host's messages were not found within 3s");
+        kill(search, Signal::SIGCONT).unwrap();
+        mcu.logged("the host is on another computer");
+        let host = near.client();
+        drop(first);
+        killed((mcu, near, host))
+    };
+    is_cut_with(&start, true);
 }
 
 #[test]

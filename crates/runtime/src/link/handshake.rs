@@ -124,8 +124,7 @@ impl Handshake {
     /// Goes on as far as it can. Call it again until it is [`Step::Wait`] or [`Step::Done`].
     pub(crate) fn step(&mut self) -> Step {
         let (Some(until), Some(surveyor)) = (self.until, &mut self.surveyor) else {
-            self.hear_late_answer();
-            return Step::Done;
+            return self.late_answer();
         };
         if self.is_finding
             && let Some(FoundHost { forms, is_other }) = self.finder.as_mut().and_then(HostFinder::answer)
@@ -158,13 +157,14 @@ impl Handshake {
         Step::Speak(dialect)
     }
 
-    /// Hears an answer that came after the host had read another dictionary.
-    fn hear_late_answer(&mut self) {
+    /// Takes an answer that came after the host had read another dictionary, which it keeps.
+    fn late_answer(&mut self) -> Step {
         let answer = self.finder.as_mut().filter(|_| self.is_overdue).and_then(HostFinder::answer);
-        let Some(FoundHost { forms, .. }) = answer else { return };
+        let Some(FoundHost { forms, .. }) = answer else { return Step::Done };
         self.is_overdue = false;
         if forms != *self.first.forms() {
             warn!("the host's messages were found too late: send RESTART to use them");
         }
+        Step::Speak(self.first.clone())
     }
 }
