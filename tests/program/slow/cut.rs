@@ -2,15 +2,12 @@
 //! The wire is cut, with outputs on: the MCU without its host, and with the next host. (On a CAN bus:
 //! `tests/kernel/guest/pinion/can.rs`.)
 
-use std::fs::File;
-use std::io::Write;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
-use pinion_protocol::block::{Sequence, frame};
 use serde_json::Value;
 
 use crate::links::{client, plug_in, plugged, pull_out};
@@ -223,11 +220,10 @@ fn an_ssh_that_is_found_late_and_killed() {
         let near = near(&mcu.link(), "");
         near.logged("serving on");
         // As klippy does, and the tests' client does not, it waits for an answer before it opens the terminal anew.
-        let mut first = File::options().read(true).write(true).open(near.link()).unwrap();
-        let mut question = Vec::new();
+        let mut first = near.port();
         // identify offset=0 count=40
-        frame(&[1, 0, 40], Sequence::default(), &mut question);
-        first.write_all(&question).unwrap();
+        first.queue_block(&[1, 0, 40], Default::default());
+        assert!(first.wait_block(Instant::now() + WAIT_MAX).unwrap().is_some());
         mcu.logged("the host's messages were not found within 3s");
         kill(search, Signal::SIGCONT).unwrap();
         mcu.logged("the host is on another computer");

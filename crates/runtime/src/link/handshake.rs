@@ -165,6 +165,7 @@ impl Handshake {
         if forms != *self.first.forms() {
             warn!("the host's messages were found too late: send RESTART to use them");
         }
+        // The same dialect: the link notes who the host is when it speaks.
         Step::Speak(self.first.clone())
     }
 }
