@@ -94,8 +94,8 @@ fn a_disk_that_can_only_be_read_is_reported() {
 
 #[test]
 fn the_usual_folders_may_be_read_only_if_the_link_is_elsewhere() {
-    // The sources may be in one of them, so their contents stay.
-    let make = "for usual in /run /var; do mount --bind $usual $usual; mount -o remount,bind,ro $usual; done; \
+    // The sources and the programs may be there, or in a file system that is mounted there, so all stays to be seen.
+    let make = "for usual in /run /var; do mount --rbind $usual $usual; mount -o remount,bind,ro $usual; done; \
                 cd \"$PWD\"; mount -t tmpfs disk disk";
     let Some(pinion) = on_a_disk(make) else { return };
     serves(&pinion);
