@@ -188,7 +188,6 @@ const TOO_MANY: Refusal = Refusal(
     "503 Service Unavailable",
     "Too many viewers watch already. Close another page with the camera, and try again.",
 );
-const NO_FRAME: Refusal = Refusal("503 Service Unavailable", "No picture can be drawn. Read Pinion's log.");
 
 struct Connection {
     stream: TcpStream,
@@ -229,12 +228,10 @@ impl Connection {
                 None => refuse(TOO_MANY),
                 Some(_place) => self.stream(layout, head_only, &reader),
             },
-            ("/snapshot", _) | ("/", Some("snapshot")) => match self.studio.next(layout, None) {
-                None => refuse(NO_FRAME),
-                Some(frame) => {
-                    self.send("200 OK", &format!("{reader}{NO_CACHE}"), "image/jpeg", &frame.jpeg, head_only)
-                }
-            },
+            ("/snapshot", _) | ("/", Some("snapshot")) => {
+                let frame = self.studio.next(layout, None);
+                self.send("200 OK", &format!("{reader}{NO_CACHE}"), "image/jpeg", &frame.jpeg, head_only)
+            }
             ("/", None) => self.send("200 OK", "", "text/html; charset=utf-8", PAGE.as_bytes(), head_only),
             _ => refuse(NOT_FOUND),
         }
@@ -267,7 +264,8 @@ impl Connection {
         }
         self.write(format!("--{BOUNDARY}\r\n").as_bytes())?;
         let mut last: Option<Arc<Frame>> = None;
-        while let Some(frame) = self.studio.next(layout, last.as_deref()) {
+        loop {
+            let frame = self.studio.next(layout, last.as_deref());
             let time = frame.time.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
             let length = frame.jpeg.len();
             let head =
@@ -277,7 +275,6 @@ impl Connection {
             self.write(&parts.concat())?;
             last = Some(frame);
         }
-        Ok(())
     }
 
     fn refuse(&self, Refusal(status, text): &Refusal, head_only: bool, reader: &str) -> io::Result<()> {

@@ -11,8 +11,6 @@ use crate::scene::Scene;
 
 /// Time from a frame to the next: 15 frames a second.
 pub const PERIOD: Duration = Duration::from_micros(1_000_000 / 15);
-/// Longest wait for a frame. A frame takes milliseconds.
-const WAIT_MAX: Duration = Duration::from_secs(10);
 /// While nobody looks, what was laid is drawn after this time, and nothing else. So it never becomes much.
 const LAYING_PERIOD: Duration = Duration::from_secs(60);
 
@@ -35,8 +33,8 @@ struct Reel {
 }
 
 impl Reel {
-    fn is_after(&self, number: u64) -> bool {
-        self.last.as_ref().is_some_and(|newest| newest.number > number)
+    fn after(&self, number: u64) -> Option<Arc<Frame>> {
+        self.last.clone().filter(|newest| newest.number > number)
     }
 }
 
@@ -67,8 +65,9 @@ impl Studio {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The first frame after `last`. Without `last` it is the newest one, unless that is old. `None` if no frame comes.
-    pub fn next(&self, layout: Layout, last: Option<&Frame>) -> Option<Arc<Frame>> {
+    /// The first frame after `last`. Without `last` it is the newest one, unless that is old. A frame takes milliseconds,
+    /// and any time on a busy computer.
+    pub fn next(&self, layout: Layout, last: Option<&Frame>) -> Arc<Frame> {
         let mut state = self.state();
         let reel = &mut state.reels[layout as usize];
         let after = match (last, &reel.last) {
@@ -76,14 +75,16 @@ impl Studio {
             (None, Some(newest)) if newest.drawn.elapsed() > PERIOD => newest.number,
             (None, _) => 0,
         };
-        if !reel.is_after(after) {
+        if reel.after(after).is_none() {
             reel.is_wanted = true;
             self.wanted.notify_one();
         }
-        let is_old = |state: &mut State| !state.reels[layout as usize].is_after(after);
-        let waited = self.drawn.wait_timeout_while(state, WAIT_MAX, is_old);
-        let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
-        state.reels[layout as usize].last.clone().filter(|newest| newest.number > after)
+        loop {
+            if let Some(frame) = state.reels[layout as usize].after(after) {
+                return frame;
+            }
+            state = self.drawn.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
     }
 
     /// Draws each frame that somebody waits for. `look` returns the scene to draw.
