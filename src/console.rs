@@ -45,8 +45,8 @@ use pinion_system::complete::{SIMULATED, offering};
 use pinion_system::files;
 use pinion_system::settings::BoardName;
 
-/// Longest wait for an answer of the MCU.
-const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
+/// Longest wait for the first answer of the MCU, which learns before that who its host is: in up to three seconds.
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 /// How often a console that waits for a line checks for messages of the MCU.
 const LOOK: Duration = Duration::from_millis(20);
 /// How many lines are remembered.
