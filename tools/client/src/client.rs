@@ -17,9 +17,6 @@ use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID}
 /// of retries is klippy's (SerialRetryCommand in serialhdl.py).
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 const RETRIES: u32 = 5;
-/// How long an open tty may stay without an answer. As long as klippy waits (`_start_session` in serialhdl.py): an MCU
-/// that learns first who its host is takes up to three seconds, and begins anew when the tty is opened again.
-const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Timeout for reading the whole dictionary.
 const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(15);
 const IDENTIFY_CHUNK: u8 = 40;
@@ -52,7 +49,9 @@ impl Client {
         let until = Instant::now() + timeout;
         loop {
             let rest = until.saturating_duration_since(Instant::now());
-            let result = BlockLink::open(path, rest.min(OPEN_TIMEOUT))
+            // As klippy does (`_start_session` in serialhdl.py), it waits five seconds before it opens the tty again: an
+            // MCU takes up to three to find out who its host is, and begins anew each time.
+            let result = BlockLink::open(path, rest.min(Duration::from_secs(5)))
                 .and_then(|link| Client::start(link, Some(path.to_owned())));
             match result {
                 Err(Error::Io { .. } | Error::Closed { .. } | Error::Timeout { .. })
