@@ -37,17 +37,18 @@ const RISING: u32 = 1;
 struct EdgeRequest {
     file: File,
     subject: Subject,
-    /// The flags of the last setup (`GPIO_V2_LINE_FLAG_`).
+    /// The flags of the last setup that the kernel took (`GPIO_V2_LINE_FLAG_`).
     flags: AtomicU64,
 }
 
 impl EdgeRequest {
     fn set(&self, flags: u64) -> Result<(), Shutdown> {
-        if flags != self.flags.swap(flags, Ordering::Relaxed) {
+        if flags != self.flags.load(Ordering::Relaxed) {
             sys::set_line_flags(&self.file, flags).map_err(|error| {
                 let code = error.raw_os_error().unwrap_or_default();
                 Shutdown::because(reason::INPUT_LINE, self.subject.refusal("an input", code, Bias::None, None, ""))
             })?;
+            self.flags.store(flags, Ordering::Relaxed);
         }
         Ok(())
     }

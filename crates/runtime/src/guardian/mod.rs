@@ -405,7 +405,9 @@ mod tests {
         let guarded = Guarded::killed("readonly");
         let log = guarded.log();
         assert!(
-            log.contains("still not at its shutdown value: pwmchip7/pwm0: Bad file descriptor (os error 9)"),
+            log.contains(
+                "not yet at its shutdown value, trying for 2 s: pwmchip7/pwm0: Bad file descriptor (os error 9)"
+            ),
             "{log}"
         );
         assert!(log.contains("only 0 of 1 outputs are driven") && log.contains("switch the power off"), "{log}");

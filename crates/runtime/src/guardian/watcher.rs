@@ -221,7 +221,7 @@ impl Watcher {
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
         let of_threads = rescue.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
-            error!("guardian: after {seconds} s still not at its shutdown value: {}", outcome.complaint());
+            error!("guardian: not yet at its shutdown value, trying for {seconds} s: {}", outcome.complaint());
         });
         alarm::set(LOG_S);
         let pid = program.pid;

@@ -88,7 +88,10 @@ mod slow {
         client.send_line("emergency_stop").expect("a session");
         assert_eq!(shutdown_of(client), "Command request");
         assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
-        program.wait_for_line(&["guardian: ", "still not at its shutdown value: pwmchip0/pwm6: Input/output error"]);
+        program.wait_for_line(&[
+            "guardian: ",
+            "not yet at its shutdown value, trying for 2 s: pwmchip0/pwm6: Input/output error",
+        ]);
         drop(failing);
         sysfs::wait_until("the guardian ends", || !exists(guardian));
         program.wait_for_line(&["is not at its shutdown value within 1000 ms", "all 1 outputs are driven"]);

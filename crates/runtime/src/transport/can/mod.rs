@@ -398,8 +398,8 @@ impl Transport for CanBus {
                     self.full_until = Some(monotonic() + FULL_PAUSE);
                     break;
                 }
-                Err(error) if is_full(&error) => break,
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                // The next frame may not go before this one.
+                Err(error) if is_full(&error) || error.kind() == ErrorKind::Interrupted => break,
                 // A read reports that the interface is down or gone. The host asks again for lost answers.
                 Err(_) => return Ok(bytes.len()),
             }
