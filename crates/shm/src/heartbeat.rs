@@ -6,7 +6,7 @@ use crate::atomic::{AtomicU32, Ordering};
 // The words of a heartbeat.
 /// When the last beat was given.
 const BEAT_AT: usize = 0;
-/// How long it may stay the last one.
+/// Longest time until the next beat.
 const SILENCE_MAX_MS: usize = 1;
 /// Whether a pending shutdown value stops the heartbeat.
 const PENDING: usize = 2;

@@ -4,7 +4,7 @@
 //!
 //! The second thread may be interrupted, too: between a read of the line and the store that ends the pulse. A late store
 //! must not cut a later pulse short. So each pulse has a number. The first thread makes a pulse when the second one has
-//! said that it watches this pulse. From then on the second one has no store for an earlier pulse in hand.
+//! said that it watches this pulse. After that the second thread cannot end an earlier pulse.
 
 use crate::atomic::{AtomicU32, Ordering, fence};
 

@@ -154,7 +154,7 @@ impl Outbox for ResponseWriter {
                 self.line(kind.len(), Level::Warn, LINES_SPARE, format_args!("{trouble}"));
             }
             Note::Trouble(shutdown) => self.stop_line("while shut down: ", gravity(shutdown), LINES_SPARE, shutdown),
-            Note::Safe(name) => line("", format_args!("{name} is at its shutdown value after all")),
+            Note::Safe(name) => line("", format_args!("{name} has now reached its shutdown value")),
             Note::Lateness(lateness, margin) => {
                 let margin = us(margin);
                 line("timers: ", format_args!("timers: {lateness}; the core wakes {margin:.1} us early"));

@@ -105,8 +105,8 @@ impl CoreEnd {
         }
     }
 
-    /// Polls until the core has finished the blocks that it was handed since `before`. To sleep and be woken takes
-    /// longer. If a bus holds the core, it does not poll: these blocks take longer still.
+    /// Polls until the core has finished the blocks that it was handed since `before`: polling takes less time than
+    /// sleeping and waking. It does not poll while a bus holds the core, which takes far longer.
     pub(crate) fn await_done(&self, before: Handed) {
         if !self.may_poll || !self.has_more_since(before) {
             return;

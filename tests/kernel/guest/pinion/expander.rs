@@ -447,9 +447,9 @@ mod slow {
         let program = &mut setup.program;
         program.wait_for_line(&["shutdown: GPIO line write failed", &fan, &line, "its chip does not answer"]);
         thread::sleep(Duration::from_millis(300));
-        assert!(!program.log().contains("after all"));
+        assert!(!program.log().contains("has now reached"));
         drop(silent);
-        program.wait_for_line(&[&fan, "is at its shutdown value after all"]);
+        program.wait_for_line(&[&fan, "has now reached its shutdown value"]);
         assert!(!setup.expander.level(3));
         // No help was necessary.
         thread::sleep(Duration::from_secs(2));

@@ -151,7 +151,7 @@ mod slow {
         program.wait_for_line(&[&text, "PWM output oid 0", "pwmchip0/pwm6: Input/output error"]);
         thread::sleep(Duration::from_millis(300));
         drop(failing);
-        program.wait_for_line(&["PWM output oid 0", "is at its shutdown value after all"]);
+        program.wait_for_line(&["PWM output oid 0", "has now reached its shutdown value"]);
         assert_eq!(pwm::output(6), OFF);
         thread::sleep(Duration::from_secs(2));
         assert!(program.is_running());
