@@ -69,20 +69,18 @@ impl Studio {
     /// and any time on a busy computer.
     pub fn next(&self, layout: Layout, last: Option<&Frame>) -> Arc<Frame> {
         let mut state = self.state();
-        let reel = &mut state.reels[layout as usize];
-        let after = match (last, &reel.last) {
+        let after = match (last, &state.reels[layout as usize].last) {
             (Some(last), _) => last.number,
             (None, Some(newest)) if newest.drawn.elapsed() > PERIOD => newest.number,
             (None, _) => 0,
         };
-        if reel.after(after).is_none() {
-            reel.is_wanted = true;
-            self.wanted.notify_one();
-        }
         loop {
-            if let Some(frame) = state.reels[layout as usize].after(after) {
+            let reel = &mut state.reels[layout as usize];
+            if let Some(frame) = reel.after(after) {
                 return frame;
             }
+            reel.is_wanted = true;
+            self.wanted.notify_one();
             state = self.drawn.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
     }

@@ -203,6 +203,16 @@ fn transfers_that_end_in_time_never_add_up_to_one_that_hangs() {
 }
 
 #[test]
+fn messages_that_end_in_time_never_add_up_to_one_that_hangs() {
+    let mut rig = Rig::with_workers(200_000_000, DISPLAY);
+    for _ in 0..3 {
+        rig.begin("spi_send oid=0 data=00");
+    }
+    rig.run_until(600_000_001);
+    assert_eq!((rig.shutdown(), rig.mcu.is_held()), (None, false));
+}
+
+#[test]
 fn a_transfer_that_fails_stops_the_mcu_once_and_the_next_configuration_works() {
     let mut rig = Rig::with_workers(1000, DISPLAY);
     rig.bench.state().broken.insert(SPI_CHIPS);
