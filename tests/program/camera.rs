@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use pinion_client::Client;
-use pinion_testkit::browser;
+use pinion_testkit::{browser, wait};
 
 use crate::process::{Pinion, WAIT_MAX, exists, output, printed};
 
@@ -49,9 +49,9 @@ fn snapshot_of(address: SocketAddr, target: &str) -> Vec<u8> {
     jpeg
 }
 
-/// 800 steps of these motors: 10 mm of x, 8 mm of filament.
-fn turn(client: &mut Client, motors: &[u8], dir: u8) {
-    let clock = client.clock_in(1.0).unwrap().wire();
+/// 800 steps of these motors after some seconds: 10 mm of x, 8 mm of filament.
+fn turn(client: &mut Client, seconds: f64, motors: &[u8], dir: u8) {
+    let clock = client.clock_in(seconds).unwrap().wire();
     for oid in motors {
         for line in [
             format!("reset_step_clock oid={oid} clock={clock}"),
@@ -65,7 +65,12 @@ fn turn(client: &mut Client, motors: &[u8], dir: u8) {
 
 #[test]
 fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
-    let (mut pinion, camera) = start(&["--show"]);
+    wait::in_time(the_picture_follows);
+}
+
+/// Each move begins after some seconds.
+fn the_picture_follows(seconds: f64) {
+    let (mut pinion, camera) = start(&["-r", "--show"]);
     let mut client = pinion.configured(MOTORS);
     // The push-pin of the built-in printer's probe goes up at the start.
     pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
@@ -75,19 +80,19 @@ fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
     let x = || {
         pinion.out().lines().rev().find_map(|line| Some(line[line.find(" x: ")? + 1..].to_owned())).unwrap_or_default()
     };
-    turn(&mut client, &[1], 1);
+    turn(&mut client, seconds, &[1], 1);
     pinion.until("the move", || pinion.out().contains("x: 70.00 mm"));
     assert!(snapshot(camera) != before, "x has moved");
-    turn(&mut client, &[1], 0);
+    turn(&mut client, seconds, &[1], 0);
     pinion.until("the way back", || x() == "x: 60.00 mm");
     pinion.until("the picture of before", || snapshot(camera) == before);
     // With the extruder it lays filament, which stays when the head is back.
-    turn(&mut client, &[1, 3], 1);
+    turn(&mut client, seconds, &[1, 3], 1);
     pinion.until("the piece", || pinion.out().contains("axis extruder: 8.00 mm\n"));
-    turn(&mut client, &[1], 0);
+    turn(&mut client, seconds, &[1], 0);
     pinion.until("the way back", || x() == "x: 60.00 mm");
     pinion.until("the filament", || snapshot(camera) != before);
-    assert!(!client.status().unwrap().is_shutdown);
+    assert!(!client.status().unwrap().is_shutdown, "{}", pinion.log());
     drop(client);
     // A viewer keeps nobody.
     let _viewer = request(camera, "/stream");
@@ -126,12 +131,15 @@ fn no_thread_of_the_camera_is_in_a_hurry() {
 
 #[test]
 fn it_works_with_the_demonstration() {
-    let (mut pinion, camera) = start(&[]);
-    pinion.until("the first move", || pinion.out().contains("home x"));
-    let before = snapshot(camera);
-    pinion.until("a picture of the move", || snapshot(camera) != before);
-    pinion.signal(Signal::SIGTERM);
-    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    // The demonstration gives itself a quarter of a second, whenever it begins.
+    wait::in_time(|_| {
+        let (mut pinion, camera) = start(&["-r"]);
+        pinion.until("the first move", || pinion.out().contains("home x"));
+        let before = snapshot(camera);
+        pinion.until("a picture of the move", || snapshot(camera) != before);
+        pinion.signal(Signal::SIGTERM);
+        assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    });
 }
 
 #[test]

@@ -180,17 +180,19 @@ fn a_dialect_that_is_named_is_spoken_whoever_comes() {
 
 /// The reading of a thermistor, with a dialect's message.
 fn read_temperature(pinion: &Pinion, host: &mut Host, query: &str) -> String {
-    let mut client = host.client(pinion);
-    let mut config = Config::default();
-    let oid = config.oid().unwrap();
-    config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
-    // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets the
-    // MCU.
-    config.apply(&mut client).unwrap();
-    let clock = client.clock_in(1.0).unwrap();
-    client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
-    let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::WAIT_MAX);
-    format!("{:?}", state.unwrap().unwrap())
+    wait::in_time(|seconds| {
+        let mut client = host.client(pinion);
+        let mut config = Config::default();
+        let oid = config.oid().unwrap();
+        config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
+        // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets the
+        // MCU.
+        config.apply(&mut client).unwrap();
+        let clock = client.clock_in(seconds).unwrap();
+        client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
+        let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::WAIT_MAX);
+        format!("{:?}", state.unwrap().unwrap())
+    })
 }
 
 #[test]

@@ -14,6 +14,7 @@ use std::time::Instant;
 use nix::sys::signal::Signal;
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{FlowArg, tcflow};
+use pinion_client::Client;
 use pinion_testkit::process::Running;
 use pinion_testkit::{here, wait};
 use serde_json::{Value, json};
@@ -57,6 +58,21 @@ const CONFIGURATION: &[&str] = &[
     "config_stepper oid=3 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
 ];
 
+/// A client that has configured the MCU and got a measurement.
+fn measured(pinion: &Pinion) -> Client {
+    wait::in_time(|seconds| {
+        let mut client = pinion.configured(CONFIGURATION);
+        client.send_line("update_digital_out oid=0 value=1").unwrap();
+        let clock = client.clock_in(seconds).unwrap().wire();
+        // An edge, for which the core must be awake.
+        client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
+        client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
+        assert!(client.status().unwrap().is_config);
+        assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
+        client
+    })
+}
+
 #[test]
 fn an_mcu_reports_its_state_in_each_phase() {
     let mut pinion = Pinion::simulated(&["--dialect", "master"]);
@@ -72,14 +88,7 @@ fn an_mcu_reports_its_state_in_each_phase() {
     assert_eq!(waiting["guardian"]["present"], false, "the simulated printer needs none");
     assert_eq!(waiting["dialect"], "master");
 
-    let mut client = pinion.configured(CONFIGURATION);
-    client.send_line("update_digital_out oid=0 value=1").unwrap();
-    let clock = client.clock_in(1.0).unwrap().wire();
-    // An edge, for which the core must be awake.
-    client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
-    client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
-    assert!(client.status().unwrap().is_config);
-    assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
+    let mut client = measured(&pinion);
     client.send_line("endstop_query_state oid=1").unwrap();
     client.link().settle().unwrap();
     let configured = status(&pinion);
@@ -261,10 +270,7 @@ fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
 #[test]
 fn what_is_measured_is_first_and_pins_are_last() {
     let pinion = Pinion::simulated(&["--dialect", "master"]);
-    let mut client = pinion.configured(CONFIGURATION);
-    let clock = client.clock_in(1.0).unwrap().wire();
-    client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
-    assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
+    let _client = measured(&pinion);
     let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
     let row =
         |text: &str| page.lines().position(|line| line.contains(text)).unwrap_or_else(|| panic!("{text}: {page}"));

@@ -18,7 +18,7 @@ use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID}
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 const RETRIES: u32 = 5;
 /// Timeout for reading the whole dictionary.
-const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(15);
+const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(60);
 const IDENTIFY_CHUNK: u8 = 40;
 /// Largest compressed dictionary that is read. A real one has a few kilobytes.
 const IDENTIFY_MAX: usize = 128 * 1024;

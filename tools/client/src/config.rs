@@ -9,7 +9,7 @@ use flate2::Crc;
 use super::{Client, Error};
 
 /// Timeout for a reset.
-const RESET_TIMEOUT: Duration = Duration::from_secs(10);
+const RESET_TIMEOUT: Duration = Duration::from_secs(60);
 /// klippy's pause between the steps of a reset.
 const RESET_PAUSE: Duration = Duration::from_millis(15);
 

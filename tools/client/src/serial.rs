@@ -66,8 +66,10 @@ struct Sent {
 #[derive(Debug)]
 pub struct BlockLink {
     port: Port,
-    sequences: [Sequence; 16],
     synchronised: bool,
+    /// No response has come yet. The number that the session began with may have answered a block of an earlier session,
+    /// which the other end had not finished.
+    is_new: bool,
     /// The number of the next new block.
     send: u64,
     /// The number of the oldest block without an acknowledgement.
@@ -103,14 +105,10 @@ impl BlockLink {
     /// Makes a link from a port, and finds out which block the other end expects next.
     pub fn new(port: Port, timeout: Duration) -> Result<BlockLink, Error> {
         let now = Instant::now();
-        let mut sequences = [Sequence::default(); 16];
-        for i in 1..sequences.len() {
-            sequences[i] = sequences[i - 1].next();
-        }
         let mut link = BlockLink {
             port,
-            sequences,
             synchronised: false,
+            is_new: true,
             send: 0,
             receive: 0,
             last_ack: 0,
@@ -180,7 +178,7 @@ impl BlockLink {
             self.retransmit_at = now + self.rto;
             self.heard_at = now;
         }
-        self.port.queue_block(payload, self.sequence(self.send));
+        self.port.queue_block(payload, Sequence::after(self.send as u32));
         self.rtt_sample.get_or_insert(self.send);
         self.send += 1;
         self.sent_bytes += payload.len() + BLOCK_MIN;
@@ -275,20 +273,21 @@ impl BlockLink {
     }
 
     fn take(&mut self, sequence: Sequence, payload: Vec<u8>, at: Instant) {
-        let index = (0..16).find(|i| self.sequence(*i) == sequence).unwrap_or(0);
+        let index = u64::from((0..16).find(|i| Sequence::after(*i) == sequence).unwrap_or(0));
         if !self.synchronised {
             if payload.is_empty() {
                 self.synchronised = true;
-                self.send = 16 + index;
-                self.receive = self.send;
-                self.last_ack = self.send;
-                self.retransmitted = self.send;
+                self.begin(index);
             }
             return;
         }
         let acknowledged = index.wrapping_sub(self.receive) & 15;
         if acknowledged > self.send - self.receive {
             // It acknowledges a block that was never sent.
+            if self.is_new {
+                self.begin(index);
+                self.send_again(at);
+            }
             return;
         }
         self.traffic.blocks_received += 1;
@@ -296,6 +295,7 @@ impl BlockLink {
             self.acknowledge(acknowledged, at);
         }
         if !payload.is_empty() {
+            self.is_new = false;
             if self.received.len() >= RECEIVED_MAX {
                 self.next_received();
             }
@@ -305,17 +305,22 @@ impl BlockLink {
             self.last_ack = self.receive;
         } else if self.receive > self.ignore_nak && !self.sent.is_empty() {
             self.traffic.naks += 1;
-            self.ignore_nak = if self.receive < self.retransmitted {
-                // This is the second NAK since the blocks were sent again. Further ones are ignored.
-                self.retransmitted
-            } else {
-                self.receive
-            };
+            // After the second NAK since the blocks were sent again, further ones are ignored.
+            self.ignore_nak = self.receive.max(self.retransmitted);
             self.send_again(at);
         }
         if self.sent.is_empty() {
             self.settled.get_or_insert(self.arrived);
         }
+    }
+
+    /// Begins with the block that the other end expects next.
+    fn begin(&mut self, index: u64) {
+        self.receive = 16 + index;
+        self.send = self.receive + self.sent.len() as u64;
+        self.last_ack = self.receive;
+        self.ignore_nak = 0;
+        self.retransmitted = self.receive;
     }
 
     fn acknowledge(&mut self, count: u64, at: Instant) {
@@ -348,8 +353,8 @@ impl BlockLink {
 
     fn send_again(&mut self, now: Instant) {
         self.port.queue(&[SYNC]);
-        for (i, sent) in self.sent.iter().enumerate() {
-            let sequence = self.sequences[(self.receive as usize + i) & 15];
+        for (i, sent) in (0..).zip(&self.sent) {
+            let sequence = Sequence::after((self.receive as u32).wrapping_add(i));
             self.port.queue_block(&sent.payload, sequence);
         }
         self.traffic.blocks_again += self.sent.len() as u64;
@@ -357,19 +362,18 @@ impl BlockLink {
         self.rtt_sample = None;
         self.retransmit_at = now + self.rto;
     }
-
-    fn sequence(&self, number: u64) -> Sequence {
-        self.sequences[(number & 15) as usize]
-    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write;
     use std::os::unix::net::UnixStream;
+    use std::thread;
 
+    use pinion_protocol::block::frame;
     use proptest::prelude::*;
 
-    use super::super::fake::{Fault, Peer};
+    use super::super::fake::{Fault, Peer, serve};
     use super::*;
 
     fn numbered(count: u32) -> Vec<Vec<u8>> {
@@ -445,6 +449,26 @@ mod tests {
         assert_eq!(link.unacknowledged(), 0);
         drop(link);
         assert_eq!(peer.join().unwrap().len(), 5000);
+    }
+
+    /// The other end had not finished blocks of an earlier session when this one began.
+    #[test]
+    fn acknowledgements_of_an_earlier_session_do_not_keep_a_session_from_its_beginning() {
+        for earlier in 0..16 {
+            let (ours, mut theirs) = UnixStream::pair().unwrap();
+            let mut acknowledgement = Vec::new();
+            frame(&[], Sequence::after(earlier), &mut acknowledgement);
+            theirs.write_all(&acknowledgement).unwrap();
+            let port = Port::from_fd(ours.into(), "busy").unwrap();
+            let mut link = BlockLink::new(port, Duration::from_secs(60)).unwrap();
+            link.send(b"first").unwrap();
+            let peer = thread::spawn(move || serve(theirs, 5, &[], |payload| vec![payload.to_vec()]));
+            while link.receive_unsettled().unwrap().is_none() {
+                link.send(b"again").unwrap();
+            }
+            drop(link);
+            assert_eq!(peer.join().unwrap().len(), 1, "{earlier}");
+        }
     }
 
     #[test]

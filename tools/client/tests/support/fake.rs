@@ -47,7 +47,8 @@ impl Peer {
     }
 }
 
-fn serve(
+/// A peer's thread.
+pub(super) fn serve(
     mut stream: UnixStream,
     before: u8,
     faults: &[(u64, Fault)],
