@@ -185,8 +185,8 @@ fn read_temperature(pinion: &Pinion, host: &mut Host, query: &str) -> String {
         let mut config = Config::default();
         let oid = config.oid().unwrap();
         config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
-        // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets the
-        // MCU.
+        // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets
+        // the MCU.
         config.apply(&mut client).unwrap();
         let clock = client.clock_in(seconds).unwrap();
         client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
