@@ -65,40 +65,38 @@ fn turn(client: &mut Client, seconds: f64, motors: &[u8], dir: u8) {
 
 #[test]
 fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
-    wait::in_time(the_picture_follows);
-}
-
-/// Each move begins after some seconds.
-fn the_picture_follows(seconds: f64) {
-    let (mut pinion, camera) = start(&["-r", "--show"]);
-    let mut client = pinion.configured(MOTORS);
-    // The push-pin of the built-in printer's probe goes up at the start.
-    pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
-    let before = snapshot(camera);
-    assert!(snapshot(camera) == before, "nothing has moved");
-    // Where x was last. Other lines may follow.
-    let x = || {
-        pinion.out().lines().rev().find_map(|line| Some(line[line.find(" x: ")? + 1..].to_owned())).unwrap_or_default()
-    };
-    turn(&mut client, seconds, &[1], 1);
-    pinion.until("the move", || pinion.out().contains("x: 70.00 mm"));
-    assert!(snapshot(camera) != before, "x has moved");
-    turn(&mut client, seconds, &[1], 0);
-    pinion.until("the way back", || x() == "x: 60.00 mm");
-    pinion.until("the picture of before", || snapshot(camera) == before);
-    // With the extruder it lays filament, which stays when the head is back.
-    turn(&mut client, seconds, &[1, 3], 1);
-    pinion.until("the piece", || pinion.out().contains("axis extruder: 8.00 mm\n"));
-    turn(&mut client, seconds, &[1], 0);
-    pinion.until("the way back", || x() == "x: 60.00 mm");
-    pinion.until("the filament", || snapshot(camera) != before);
-    assert!(!client.status().unwrap().is_shutdown, "{}", pinion.log());
-    drop(client);
-    // A viewer keeps nobody.
-    let _viewer = request(camera, "/stream");
-    pinion.signal(Signal::SIGTERM);
-    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
-    assert!(!exists(&pinion.link()));
+    wait::in_time(|seconds| {
+        let (mut pinion, camera) = start(&["-r", "--show"]);
+        let mut client = pinion.configured(MOTORS);
+        // The push-pin of the built-in printer's probe goes up at the start.
+        pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
+        let before = snapshot(camera);
+        assert!(snapshot(camera) == before, "nothing has moved");
+        // Where x was last. Other lines may follow.
+        let x = || {
+            let out = pinion.out();
+            out.lines().rev().find_map(|line| Some(line[line.find(" x: ")? + 1..].to_owned())).unwrap_or_default()
+        };
+        turn(&mut client, seconds, &[1], 1);
+        pinion.until("the move", || pinion.out().contains("x: 70.00 mm"));
+        assert!(snapshot(camera) != before, "x has moved");
+        turn(&mut client, seconds, &[1], 0);
+        pinion.until("the way back", || x() == "x: 60.00 mm");
+        pinion.until("the picture of before", || snapshot(camera) == before);
+        // With the extruder it lays filament, which stays when the head is back.
+        turn(&mut client, seconds, &[1, 3], 1);
+        pinion.until("the piece", || pinion.out().contains("axis extruder: 8.00 mm\n"));
+        turn(&mut client, seconds, &[1], 0);
+        pinion.until("the way back", || x() == "x: 60.00 mm");
+        pinion.until("the filament", || snapshot(camera) != before);
+        assert!(!client.status().unwrap().is_shutdown, "{}", pinion.log());
+        drop(client);
+        // A viewer keeps nobody.
+        let _viewer = request(camera, "/stream");
+        pinion.signal(Signal::SIGTERM);
+        assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+        assert!(!exists(&pinion.link()));
+    });
 }
 
 #[test]

@@ -113,8 +113,7 @@ fn an_mcu_reports_its_state_in_each_phase() {
     assert_eq!(buckets.iter().map(|bucket| bucket[1].as_u64().unwrap()).sum::<u64>(), timers);
     assert_eq!(timers, 1, "the edge, and none of the samples");
 
-    client.send_line("emergency_stop").unwrap();
-    client.wait_shutdown(WAIT_MAX).unwrap();
+    client.emergency_stop().unwrap();
     let stopped = status(&pinion);
     assert_eq!(stopped["state"], "shutdown");
     assert_eq!(stopped["shutdown"]["reason"], "Command request");
@@ -252,8 +251,7 @@ fn keys_that_arrive_together_all_count() {
 fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
     let pinion = Pinion::simulated(&[]);
     let mut client = pinion.configured(CONFIGURATION);
-    client.send_line("emergency_stop").unwrap();
-    client.wait_shutdown(WAIT_MAX).unwrap();
+    client.emergency_stop().unwrap();
     let detail = status(&pinion)["shutdown"]["detail"].as_str().unwrap().to_owned();
     let mut watch = AtTerminal::start(&mut watch(&pinion), 60, None);
     watch.resize(60, 40);

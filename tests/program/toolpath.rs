@@ -23,32 +23,30 @@ fn the_path_is_written_when_the_program_ends() {
         ("path.gcode", Signal::SIGTERM, ["G90\n", "G0 X60.0000 Y45.0000 Z12.0000", "G1 X62.5000 Y45.0000 Z12.0000"]),
         ("path.stl", Signal::SIGINT, ["filament laid", "", ""]),
     ] {
-        wait::in_time(|seconds| the_path_is_written(name, signal, parts, seconds));
+        wait::in_time(|seconds| {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join(name);
+            let mut pinion = Pinion::start_in(folder, &["sim", "-r", "--toolpath", path.to_str().unwrap()]);
+            pinion.wait_for_link();
+            let mut client = pinion.configured(X_AXIS);
+            client.send_line("set_next_step_dir oid=0 dir=1").unwrap();
+            let clock = client.clock_in(seconds).unwrap().wire();
+            client.send_line(&format!("reset_step_clock oid=0 clock={clock}")).unwrap();
+            client.send_line("queue_step oid=0 interval=25000 count=200 add=0").unwrap();
+            wait::until("the end of the move", || {
+                let oid = [("oid", 0_u8.into())];
+                let position = client.query("stepper_get_position", &oid, "stepper_position", Some(0)).unwrap();
+                position.int("pos").unwrap() == 200
+            });
+            drop(client);
+            pinion.signal(signal);
+            assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+            let written = fs::read(&path).unwrap();
+            let text = String::from_utf8_lossy(&written);
+            parts.iter().for_each(|part| assert!(text.contains(part), "no {part} in {name}:\n{text}"));
+            assert!(pinion.out().contains(name), "{}", pinion.out());
+        });
     }
-}
-
-/// The move begins after some seconds.
-fn the_path_is_written(name: &str, signal: Signal, parts: [&str; 3], seconds: f64) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(name);
-    let mut pinion = Pinion::start_in(folder, &["sim", "-r", "--toolpath", path.to_str().unwrap()]);
-    pinion.wait_for_link();
-    let mut client = pinion.configured(X_AXIS);
-    client.send_line("set_next_step_dir oid=0 dir=1").unwrap();
-    let clock = client.clock_in(seconds).unwrap().wire();
-    client.send_line(&format!("reset_step_clock oid=0 clock={clock}")).unwrap();
-    client.send_line("queue_step oid=0 interval=25000 count=200 add=0").unwrap();
-    wait::until("the end of the move", || {
-        let position = client.query("stepper_get_position", &[("oid", 0_u8.into())], "stepper_position", Some(0));
-        position.unwrap().int("pos").unwrap() == 200
-    });
-    drop(client);
-    pinion.signal(signal);
-    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
-    let written = fs::read(&path).unwrap();
-    let text = String::from_utf8_lossy(&written);
-    parts.iter().for_each(|part| assert!(text.contains(part), "no {part} in {name}:\n{text}"));
-    assert!(pinion.out().contains(name), "{}", pinion.out());
 }
 
 #[test]

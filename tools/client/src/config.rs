@@ -105,10 +105,10 @@ impl Client {
         })
     }
 
-    /// Shuts the MCU down. Returns its reason; `None` if it gives none within a second.
+    /// Shuts the MCU down. Returns its reason; `None` if it gives none within a minute.
     pub fn emergency_stop(&mut self) -> Result<Option<String>, Error> {
         self.send("emergency_stop", &[])?;
-        self.wait_shutdown(Duration::from_secs(1))
+        self.wait_shutdown(RESET_TIMEOUT)
     }
 
     /// Resets the MCU as klippy's FIRMWARE_RESTART does: `emergency_stop`, `config_reset`, a new session. (`reset` if

@@ -60,16 +60,25 @@ struct Sent {
     at: Instant,
 }
 
+/// What is known of the number that a session begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Beginning {
+    /// Nothing: no acknowledgement has come.
+    Unknown,
+    /// An acknowledgement had it, but no response has come. It may have answered a block of an earlier session, which
+    /// the other end had not finished.
+    Assumed,
+    /// A response has come: it is right.
+    Known,
+}
+
 /// Delivers payloads in order, each once.
 ///
 /// Numbers count blocks from the session's start. The wire carries them modulo 16.
 #[derive(Debug)]
 pub struct BlockLink {
     port: Port,
-    synchronised: bool,
-    /// No response has come yet. The number that the session began with may have answered a block of an earlier session,
-    /// which the other end had not finished.
-    is_new: bool,
+    beginning: Beginning,
     /// The number of the next new block.
     send: u64,
     /// The number of the oldest block without an acknowledgement.
@@ -107,8 +116,7 @@ impl BlockLink {
         let now = Instant::now();
         let mut link = BlockLink {
             port,
-            synchronised: false,
-            is_new: true,
+            beginning: Beginning::Unknown,
             send: 0,
             receive: 0,
             last_ack: 0,
@@ -137,7 +145,7 @@ impl BlockLink {
     /// host may have left incomplete.
     fn synchronise(&mut self, timeout: Duration) -> Result<(), Error> {
         let until = Instant::now() + timeout;
-        while !self.synchronised {
+        while self.beginning == Beginning::Unknown {
             let now = Instant::now();
             if now >= until {
                 return Err(Error::Timeout { waiting_for: format!("answer on {}", self.port.name), after: timeout });
@@ -147,7 +155,7 @@ impl BlockLink {
                 self.port.queue_block(&[], Sequence::default());
             }
             let again = until.min(now + Duration::from_millis(100));
-            while !self.synchronised && Instant::now() < again {
+            while self.beginning == Beginning::Unknown && Instant::now() < again {
                 self.exchange(again)?;
             }
         }
@@ -274,9 +282,8 @@ impl BlockLink {
 
     fn take(&mut self, sequence: Sequence, payload: Vec<u8>, at: Instant) {
         let index = u64::from((0..16).find(|i| Sequence::after(*i) == sequence).unwrap_or(0));
-        if !self.synchronised {
+        if self.beginning == Beginning::Unknown {
             if payload.is_empty() {
-                self.synchronised = true;
                 self.begin(index);
             }
             return;
@@ -284,7 +291,7 @@ impl BlockLink {
         let acknowledged = index.wrapping_sub(self.receive) & 15;
         if acknowledged > self.send - self.receive {
             // It acknowledges a block that was never sent.
-            if self.is_new {
+            if self.beginning == Beginning::Assumed {
                 self.begin(index);
                 self.send_again(at);
             }
@@ -295,7 +302,7 @@ impl BlockLink {
             self.acknowledge(acknowledged, at);
         }
         if !payload.is_empty() {
-            self.is_new = false;
+            self.beginning = Beginning::Known;
             if self.received.len() >= RECEIVED_MAX {
                 self.next_received();
             }
@@ -316,6 +323,7 @@ impl BlockLink {
 
     /// Begins with the block that the other end expects next.
     fn begin(&mut self, index: u64) {
+        self.beginning = Beginning::Assumed;
         self.receive = 16 + index;
         self.send = self.receive + self.sent.len() as u64;
         self.last_ack = self.receive;
@@ -327,11 +335,9 @@ impl BlockLink {
         self.heard_at = at;
         self.receive += count;
         let mut sent_at = at;
-        for _ in 0..count {
-            if let Some(sent) = self.sent.pop_front() {
-                self.sent_bytes -= sent.payload.len() + BLOCK_MIN;
-                sent_at = sent.at;
-            }
+        for sent in self.sent.drain(..count as usize) {
+            self.sent_bytes -= sent.payload.len() + BLOCK_MIN;
+            sent_at = sent.at;
         }
         if self.rtt_sample.is_some_and(|sample| self.receive > sample) {
             self.rtt_sample = None;
