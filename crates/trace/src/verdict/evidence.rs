@@ -175,11 +175,14 @@ impl<'a> Record<'a> {
         self.within(Thread::Link, span).any(|(_, event)| event == Event::Alive)
     }
 
-    /// How many blocks the host sent again within a span, and whether it asked for something that the link answers.
-    pub(super) fn signs_of_host(&self, span: Span) -> (usize, bool) {
-        let events = || self.within(Thread::Link, span).map(|(_, event)| event);
-        let repeated = events().filter(|event| *event == Event::Refused(Refusal::Repeated)).count();
-        (repeated, events().any(|event| matches!(event, Event::Answered { .. })))
+    /// How many blocks the host sent again within a span.
+    pub(super) fn blocks_again(&self, span: Span) -> usize {
+        self.within(Thread::Link, span).filter(|(_, event)| *event == Event::Refused(Refusal::Repeated)).count()
+    }
+
+    /// Whether the host asked within a span for something that the link answers.
+    pub(super) fn asked(&self, span: Span) -> bool {
+        self.within(Thread::Link, span).any(|(_, event)| matches!(event, Event::Answered { .. }))
     }
 
     /// Whether garbage came from the host in a span.

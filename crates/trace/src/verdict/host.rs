@@ -133,8 +133,6 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Judgmen
     if let Some(finding) = of_link(record, (before, 0)) {
         return finding;
     }
-    let span = (before + PROMPT, 0);
-    let signs = record.signs_of_host(span);
     let heard = record.last_heard(0).unwrap_or(before);
     let was_alive = record.was_alive((heard, 0));
     // While its host says nothing, `pinion link` sends a keepalive every two seconds.
@@ -144,18 +142,19 @@ pub(super) fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Judgmen
         let what = format!("{came} came over {wire} for {}{}", span_text(-heard), on_time(record));
         return with_power(record, (before, 0), Judgment::new(Culprit::Wire, what, wire_remedy(wire)));
     }
-    let alive = match signs {
-        (0, true) => ", but it still asked for the clock".to_owned(),
-        (0, false) if was_alive => ", but its computer sent keepalives".to_owned(),
-        _ => resent(record, (before, 0)),
+    let alive = match (record.asked((before + PROMPT, 0)), was_alive) {
+        (true, _) => ", but it still asked for the clock",
+        (false, true) => ", but its computer sent keepalives",
+        (false, false) => "",
     };
-    let what = format!("the host sent no commands for {}{alive}{}", span_text(-before), on_time(record));
+    let resent = resent(record, (before, 0));
+    let what = format!("the host sent no commands for {}{alive}{resent}{}", span_text(-before), on_time(record));
     with_power(record, (before, 0), Judgment::new(Culprit::Host, what, "look at its log, and at its load"))
 }
 
 /// How often the host sent blocks again, as a clause behind others.
 fn resent(record: &Record, span: Span) -> String {
-    match record.signs_of_host(span).0 {
+    match record.blocks_again(span) {
         0 => String::new(),
         1 => "; it sent a block again, without an acknowledgement in time".to_owned(),
         blocks => format!("; it sent {blocks} blocks again, without acknowledgements in time"),

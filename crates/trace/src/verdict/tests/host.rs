@@ -110,6 +110,13 @@ fn a_network_that_is_gone_is_no_host_that_hangs() {
         Culprit::Host,
         "the host sent no commands for 4.4 s, but its computer sent keepalives; the core was never later than 0.1 ms: look at its log, and at its load",
     );
+    // It had sent a block again before it hung.
+    let again = silent().and("link", STOP - 4 * SECOND, Event::Refused(Refusal::Repeated));
+    again.and("link", STOP - SECOND, Event::Alive).judged_over(
+        SSH,
+        Culprit::Host,
+        "the host sent no commands for 4.4 s, but its computer sent keepalives; it sent a block again, without an acknowledgement in time; the core was never later than 0.1 ms: look at its log, and at its load",
+    );
 }
 
 #[test]
