@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::moonraker::{Host, Moonraker};
+use super::moonraker::{Host, LEAVE_TIMEOUT, Moonraker};
 use super::work::Work;
 
 /// How long a fan may take until its tachometer counts. klippy reports a speed each second.
@@ -28,7 +28,7 @@ impl Work<'_> {
             self.report.line(left);
             return Ok(());
         }
-        let restarted = if is_changed { moonraker.restart() } else { Ok(()) };
+        let restarted = if is_changed { moonraker.restart(LEAVE_TIMEOUT) } else { Ok(()) };
         let measured = restarted.and_then(|()| self.first_value(&moonraker))?;
         self.report.line(&measured);
         self.report.set("measured", json!(measured));

@@ -15,7 +15,7 @@ use pinion_system::uses::{Resource, Source, Use, Uses};
 
 use super::catalog::{Catalog, Device};
 use super::edit::{Edit, Editor};
-use super::moonraker::Moonraker;
+use super::moonraker::{LEAVE_TIMEOUT, Moonraker};
 use super::plan::{I2C_DEV, MODULES};
 use super::printer::Target;
 use super::report::Report;
@@ -98,7 +98,7 @@ pub(super) fn undo(
     // Without klippy, nothing has to restart.
     let is_named = args.moonraker.is_some();
     if let Some(address) = moonraker.filter(|_| is_named || computer.processes(Process::is_klippy).next().is_some()) {
-        let restarted = Moonraker(&address).restart();
+        let restarted = Moonraker(&address).restart(LEAVE_TIMEOUT);
         report.set("warning", json!(restarted.as_ref().err()));
         report.line(match restarted {
             Ok(()) => "The host has restarted without the device.".to_owned(),

@@ -79,7 +79,10 @@ mod tests {
     fn a_pi_s_program_is_asked_where_the_kernel_does_not_say_and_not_waited_for() {
         let tree = Tree::empty();
         let bits_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
-        let good = bits_by("#!/bin/sh\necho throttled=0x80000\n");
+        // A busy computer may start the program later than it is waited for.
+        let mut asked = (0..5).map(|_| bits_by("#!/bin/sh\necho throttled=0x80000\n"));
+        let is_known = |findings: &Vec<Finding>| !findings[0].trouble.found().contains("unknown");
+        let good = asked.find(is_known).expect("an answer");
         says(&good, "power", Warning, "at times the processors are at their temperature limit");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
         for script in ["#!/bin/sh\nexec sleep 1000\n", "#!/bin/sh\necho nonsense\n", "not a program"] {

@@ -14,16 +14,15 @@ use crate::process::{Pinion, closed_pipe, folder_with, output, pinion_path, prin
 
 #[test]
 fn a_demonstration_that_is_interrupted_ends_without_a_complaint() {
-    let mut pinion = wait::in_time(|_| {
-        let pinion = Pinion::start(&["sim", "-r"]);
+    wait::in_time(|_| {
+        let mut pinion = Pinion::start(&["sim", "-r"]);
         pinion.until("the homing", || pinion.out().contains("home x"));
-        pinion
+        assert!(matches!(pinion.scheduling("demo")[..], [(0, _)]), "its client is no part of the MCU (SCHED_OTHER)");
+        pinion.signal(Signal::SIGINT);
+        assert_eq!(pinion.end().code(), Some(0));
+        assert!(!pinion.log().contains("ERROR"), "{}", pinion.log());
+        assert!(!pinion.out().contains("until Ctrl-C"), "{}", pinion.out());
     });
-    assert!(matches!(pinion.scheduling("demo")[..], [(0, _)]), "its client is no part of the MCU (SCHED_OTHER)");
-    pinion.signal(Signal::SIGINT);
-    assert_eq!(pinion.end().code(), Some(0));
-    assert!(!pinion.log().contains("ERROR"), "{}", pinion.log());
-    assert!(!pinion.out().contains("until Ctrl-C"), "{}", pinion.out());
 }
 
 #[test]

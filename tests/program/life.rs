@@ -18,8 +18,9 @@ use nix::unistd::{getegid, ttyname};
 use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
+use pinion_testkit::wait;
 
-use crate::process::{Pinion, WAIT_MAX, exists, output};
+use crate::process::{FAREWELL, Pinion, WAIT_MAX, exists, last_reason, output};
 
 #[test]
 fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
@@ -216,54 +217,64 @@ fn force_shutdown_stops_the_mcu_and_a_reset_starts_it_anew() {
 
 #[test]
 fn sigterm_informs_the_host_and_drives_outputs_to_their_shutdown_values() {
-    let mut pinion = Pinion::simulated(&[]);
-    let mut client = pinion.configured(&["config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0"]);
-    client.send_line("update_digital_out oid=0 value=1").unwrap();
-    client.link().settle().unwrap();
-    pinion.signal(Signal::SIGTERM);
-    // The terminal stays open until the host has read the news, even if the host is busy for a moment.
-    pinion.logged("shutdown: Force shutdown command: ");
-    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
-    drop(client);
-    assert_eq!(pinion.end().code(), Some(0));
+    wait::in_time(|_| {
+        let mut pinion = Pinion::simulated(&[]);
+        let mut client =
+            pinion.configured(&["config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0"]);
+        client.send_line("update_digital_out oid=0 value=1").unwrap();
+        client.link().settle().unwrap();
+        let signaled = Instant::now();
+        pinion.signal(Signal::SIGTERM);
+        // The terminal stays open until the host has read the news, even if the host is busy for a moment.
+        pinion.logged("shutdown: Force shutdown command: ");
+        assert_eq!(last_reason(&mut client, signaled).as_deref(), Some("Force shutdown command"));
+        drop(client);
+        assert_eq!(pinion.end().code(), Some(0));
+    });
 }
 
 #[test]
 fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
-    let mut pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    let query = client.messages().encode_line("identify offset=0 count=40").unwrap();
-    let stop = client.messages().encode_line("emergency_stop").unwrap();
-    // More answers than the terminal can hold, and fewer than the program drops.
-    let queries = query.repeat(PAYLOAD_MAX / query.len());
-    let answers_bytes = PAYLOAD_MAX / query.len() * 40;
-    let blocks = (terminal_bytes() + 40 * 1024) / answers_bytes;
-    let mut sequence = Sequence::default();
-    let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
-    // The expected number is unknown: the first fifteen blocks find it. The others continue from there.
-    for _ in 0..15 + blocks {
-        let mut block = Vec::new();
-        frame(&queries, sequence, &mut block);
-        tty.write_all(&block).unwrap();
-        sequence = sequence.next();
-    }
-    let mut block = Vec::new();
-    frame(&stop, sequence, &mut block);
-    tty.write_all(&block).unwrap();
-    pinion.logged("shutdown: Command request");
-    pinion.signal(Signal::SIGTERM);
-    let until = Instant::now() + WAIT_MAX;
-    let mut last = Vec::new();
-    while let Ok(Some((_, payload))) = client.link().port().wait_block(until) {
-        last = client.messages().decode(&Received { payload, at: Instant::now() });
-        if last.iter().any(|params| params.name == "shutdown") {
-            break;
+    wait::in_time(|_| {
+        let mut pinion = Pinion::simulated(&[]);
+        let mut client = pinion.client();
+        let query = client.messages().encode_line("identify offset=0 count=40").unwrap();
+        let stop = client.messages().encode_line("emergency_stop").unwrap();
+        // More answers than the terminal can hold, and fewer than the program drops.
+        let queries = query.repeat(PAYLOAD_MAX / query.len());
+        let answers_bytes = PAYLOAD_MAX / query.len() * 40;
+        let blocks = (terminal_bytes() + 20 * 1024) / answers_bytes;
+        let mut sequence = Sequence::default();
+        let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
+        // The expected number is unknown: the first fifteen blocks find it. The others continue from there.
+        for _ in 0..15 + blocks {
+            let mut block = Vec::new();
+            frame(&queries, sequence, &mut block);
+            tty.write_all(&block).unwrap();
+            sequence = sequence.next();
         }
-    }
-    let reasons: Vec<String> = last.iter().filter_map(|params| params.text("static_string_id").ok()).collect();
-    assert_eq!(reasons, ["Command request"], "{last:?}");
-    drop((client, tty));
-    assert_eq!(pinion.end().code(), Some(0));
+        let mut block = Vec::new();
+        frame(&stop, sequence, &mut block);
+        tty.write_all(&block).unwrap();
+        pinion.logged("shutdown: Command request");
+        let signaled = Instant::now();
+        pinion.signal(Signal::SIGTERM);
+        let until = Instant::now() + WAIT_MAX;
+        let mut last = Vec::new();
+        while let Ok(Some((_, payload))) = client.link().port().wait_block(until) {
+            last = client.messages().decode(&Received { payload, at: Instant::now() });
+            if last.iter().any(|params| params.name == "shutdown") {
+                break;
+            }
+        }
+        let reasons: Vec<String> = last.iter().filter_map(|params| params.text("static_string_id").ok()).collect();
+        if reasons.is_empty() && signaled.elapsed() >= FAREWELL {
+            wait::was_late("the terminal is closed");
+        }
+        assert_eq!(reasons, ["Command request"], "{last:?}");
+        drop((client, tty));
+        assert_eq!(pinion.end().code(), Some(0));
+    });
 }
 
 /// Number of bytes that a terminal holds for a host that does not read.
@@ -334,14 +345,17 @@ fn hosts_that_come_and_go_by_the_thousand_do_not_hide_the_one_that_leaves() {
     let mut client = pinion.client();
     client.status().unwrap();
     pinion.logged("host attached");
+    // A client that has no answer for long opens the terminal again.
+    let gone = || pinion.log().matches("host gone").count();
+    let before = gone();
     // Another process that opens and closes the terminal at the same time takes no data from it.
     for _ in 0..20_000 {
         drop(fs::File::open(pinion.link()).unwrap());
     }
     client.status().unwrap();
-    assert!(!pinion.log().contains("host gone"));
+    assert_eq!(gone(), before);
     drop(client);
-    pinion.logged("host gone");
+    pinion.until("the host's end", || gone() == before + 1);
 }
 
 #[test]
@@ -356,7 +370,10 @@ fn what_the_host_and_the_service_manager_ask_for_is_no_warning() {
     let log = pinion.log();
     assert!(log.contains("INFO  shutdown: Command request: "), "{log}");
     assert!(log.contains("INFO  shutdown: Force shutdown command: "), "{log}");
-    assert!(!log.contains("WARN") && !log.contains("ERROR"), "{log}");
+    // A busy computer may find the host's messages late, and warns of that.
+    let is_trouble = |line: &&str| line.contains("WARN") || line.contains("ERROR");
+    let troubles: Vec<&str> = log.lines().filter(is_trouble).filter(|line| !line.contains("messages were ")).collect();
+    assert!(troubles.is_empty(), "{log}");
 }
 
 /// A full pipe.
@@ -394,10 +411,13 @@ fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
 fn a_log_that_is_read_again_says_how_much_of_it_was_left_out() {
     let (reader, mut pinion) = with_full_log();
     let mut client = pinion.client();
-    // Each reset gives three log lines. Of each kind that is more than the program writes.
+    let [stop, reset] = ["emergency_stop", "config_reset"].map(|line| client.messages().encode_line(line).unwrap());
+    // Each stop gives two log lines. Of each kind that is more than the program writes in a minute.
     for _ in 0..80 {
-        client.reset().unwrap();
+        client.link().send(&stop).unwrap();
+        client.link().send(&reset).unwrap();
     }
+    client.link().settle().unwrap();
     let (sender, lines) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
         let lines = BufReader::new(reader).lines().map_while(Result::ok);

@@ -6,6 +6,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+use std::{mem, thread};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -113,9 +115,9 @@ impl Pinion {
     }
 
     /// The remains of a program that has ended: its folder, and its link there.
-    pub fn into_folder(self) -> (TempDir, PathBuf) {
+    pub fn into_folder(mut self) -> (TempDir, PathBuf) {
         let link = self.link();
-        (self.folder, link)
+        (mem::replace(&mut self.folder, tempfile::tempdir().unwrap()), link)
     }
 
     /// Its folder.
@@ -218,6 +220,27 @@ impl Pinion {
         let line = status.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(':')).unwrap();
         line.split_whitespace().next().unwrap().parse().unwrap()
     }
+}
+
+impl Drop for Pinion {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            wait::failed_with(&self.log());
+        }
+    }
+}
+
+/// How long the program keeps the terminal at its end, for a host that still reads.
+pub const FAREWELL: Duration = Duration::from_secs(1);
+
+/// The last reason that a host reads from a program that ends since then.
+pub fn last_reason(client: &mut Client, since: Instant) -> Option<String> {
+    client.wait_shutdown(WAIT_MAX).unwrap_or_else(|error| {
+        if since.elapsed() >= FAREWELL {
+            wait::was_late("the terminal is closed");
+        }
+        panic!("{error}")
+    })
 }
 
 /// Configures an MCU with these objects.

@@ -57,8 +57,9 @@ fn the_search_ends_with_the_program_and_not_before() {
     for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
         kill(Pid::from_raw(search as i32), signal).unwrap();
     }
-    drop(pinion.client());
+    let client = pinion.client();
     pinion.logged(&format!("the host, process {}, is not a klippy", std::process::id()));
+    drop(client);
     pinion.signal(Signal::SIGKILL);
     pinion.end();
     pinion.until("the search's end", || is_gone(search));

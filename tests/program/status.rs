@@ -34,6 +34,15 @@ fn ask(pinion: &Pinion, args: &[&str]) -> std::process::Output {
     Command::new(pinion_path()).arg("status").args(args).arg("-I").arg(link).output().unwrap()
 }
 
+/// The same as text, with the MCU's part: see [`status`].
+fn page_of(pinion: &Pinion, args: &[&str]) -> String {
+    let whole = || {
+        let page = String::from_utf8(ask(pinion, args).stdout).unwrap();
+        (!["unknown: the core", "state=\"unknown\"} 1"].iter().any(|late| page.contains(late))).then_some(page)
+    };
+    wait::until_some(whole, || format!("the MCU's part; the log:\n{}", pinion.log()))
+}
+
 /// The whole state. An answer comes without the MCU's part if the core takes over a second for it.
 pub fn status(pinion: &Pinion) -> Value {
     let socket = socket(pinion);
@@ -58,83 +67,87 @@ const CONFIGURATION: &[&str] = &[
     "config_stepper oid=3 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
 ];
 
-/// A client that has configured the MCU and got a measurement.
-fn measured(pinion: &Pinion) -> Client {
-    wait::in_time(|seconds| {
-        let mut client = pinion.configured(CONFIGURATION);
-        client.send_line("update_digital_out oid=0 value=1").unwrap();
-        let clock = client.clock_in(seconds).unwrap().wire();
-        // An edge, for which the core must be awake.
-        client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
-        client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
-        assert!(client.status().unwrap().is_config);
-        assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
-        client
-    })
+/// A client that has configured the MCU and got a measurement after some seconds.
+fn measured(pinion: &Pinion, seconds: f64) -> Client {
+    let mut client = pinion.configured(CONFIGURATION);
+    client.send_line("update_digital_out oid=0 value=1").unwrap();
+    let clock = client.clock_in(seconds).unwrap().wire();
+    // An edge, for which the core must be awake.
+    client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
+    client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
+    assert!(client.status().unwrap().is_config);
+    assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
+    client
 }
 
 #[test]
 fn an_mcu_reports_its_state_in_each_phase() {
-    let mut pinion = Pinion::simulated(&["--dialect", "master"]);
-    let socket = socket(&pinion);
-    pinion.until("the socket", || exists(&socket));
-    let waiting = status(&pinion);
-    assert_eq!(waiting["state"], "waiting");
-    assert_eq!(waiting["pid"], pinion.pid());
-    let version = printed(&["--version"]);
-    assert_eq!(waiting["version"], version.trim().strip_prefix("pinion ").unwrap(), "the build's, not the package's");
-    assert_eq!(waiting["link"], pinion.link().to_str().unwrap());
-    assert_eq!((&waiting["host"]["attached"], &waiting["shutdown"]), (&json!(false), &Value::Null));
-    assert_eq!(waiting["guardian"]["present"], false, "the simulated printer needs none");
-    assert_eq!(waiting["dialect"], "master");
+    wait::in_time(|seconds| {
+        let mut pinion = Pinion::simulated(&["--dialect", "master"]);
+        let socket = socket(&pinion);
+        pinion.until("the socket", || exists(&socket));
+        let waiting = status(&pinion);
+        assert_eq!(waiting["state"], "waiting");
+        assert_eq!(waiting["pid"], pinion.pid());
+        let version = printed(&["--version"]);
+        assert_eq!(
+            waiting["version"],
+            version.trim().strip_prefix("pinion ").unwrap(),
+            "the build's, not the package's"
+        );
+        assert_eq!(waiting["link"], pinion.link().to_str().unwrap());
+        assert_eq!((&waiting["host"]["attached"], &waiting["shutdown"]), (&json!(false), &Value::Null));
+        assert_eq!(waiting["guardian"]["present"], false, "the simulated printer needs none");
+        assert_eq!(waiting["dialect"], "master");
 
-    let mut client = measured(&pinion);
-    client.send_line("endstop_query_state oid=1").unwrap();
-    client.link().settle().unwrap();
-    let configured = status(&pinion);
-    assert_eq!(configured["state"], "configured");
-    assert_eq!(configured["host"]["attached"], true);
-    assert_eq!(*line(&configured, "led"), json!({ "pin": "led", "use": "output", "level": 1, "bus": null }));
-    assert_eq!(*line(&configured, "x_step"), json!({ "pin": "x_step", "use": "output", "level": 0, "bus": null }));
-    let stop = line(&configured, "x_endstop");
-    assert_eq!(stop["use"], "input");
-    assert!(stop["level"].is_u64(), "it was sampled: {stop}");
-    let objects = configured["objects"].as_array().unwrap();
-    assert_eq!(objects.len(), 4);
-    assert_eq!(objects[0]["kind"], "digital output");
-    assert_eq!((&objects[2]["oid"], &objects[2]["pin"]), (&json!(2), &json!("bed_sensor")));
-    let share = objects[2]["value"]["adc"].as_f64().unwrap();
-    assert!(share > 0.0 && share < 1.0, "{share}");
-    assert!(objects[2]["bus"]["transfers"].as_u64().is_some_and(|transfers| transfers > 0), "{}", objects[2]);
-    assert_eq!(objects[3]["value"]["steps"], 0);
-    assert_eq!(configured["queues"]["moves"], json!({ "waiting": 0, "size": 1024 }));
-    let timers = configured["lateness"]["timers"].as_u64().unwrap();
-    let buckets = configured["lateness"]["buckets_us"].as_array().unwrap();
-    assert_eq!(buckets.iter().map(|bucket| bucket[1].as_u64().unwrap()).sum::<u64>(), timers);
-    assert_eq!(timers, 1, "the edge, and none of the samples");
+        let mut client = measured(&pinion, seconds);
+        client.send_line("endstop_query_state oid=1").unwrap();
+        client.link().settle().unwrap();
+        let configured = status(&pinion);
+        assert_eq!(configured["state"], "configured");
+        assert_eq!(configured["host"]["attached"], true);
+        assert_eq!(*line(&configured, "led"), json!({ "pin": "led", "use": "output", "level": 1, "bus": null }));
+        assert_eq!(*line(&configured, "x_step"), json!({ "pin": "x_step", "use": "output", "level": 0, "bus": null }));
+        let stop = line(&configured, "x_endstop");
+        assert_eq!(stop["use"], "input");
+        assert!(stop["level"].is_u64(), "it was sampled: {stop}");
+        let objects = configured["objects"].as_array().unwrap();
+        assert_eq!(objects.len(), 4);
+        assert_eq!(objects[0]["kind"], "digital output");
+        assert_eq!((&objects[2]["oid"], &objects[2]["pin"]), (&json!(2), &json!("bed_sensor")));
+        let share = objects[2]["value"]["adc"].as_f64().unwrap();
+        assert!(share > 0.0 && share < 1.0, "{share}");
+        assert!(objects[2]["bus"]["transfers"].as_u64().is_some_and(|transfers| transfers > 0), "{}", objects[2]);
+        assert_eq!(objects[3]["value"]["steps"], 0);
+        assert_eq!(configured["queues"]["moves"], json!({ "waiting": 0, "size": 1024 }));
+        let timers = configured["lateness"]["timers"].as_u64().unwrap();
+        let buckets = configured["lateness"]["buckets_us"].as_array().unwrap();
+        assert_eq!(buckets.iter().map(|bucket| bucket[1].as_u64().unwrap()).sum::<u64>(), timers);
+        assert_eq!(timers, 1, "the edge, and none of the samples");
 
-    client.emergency_stop().unwrap();
-    let stopped = status(&pinion);
-    assert_eq!(stopped["state"], "shutdown");
-    assert_eq!(stopped["shutdown"]["reason"], "Command request");
-    // The log has the same text.
-    let logged = pinion.logged("shutdown: Command request: ");
-    assert!(logged.ends_with(stopped["shutdown"]["detail"].as_str().unwrap()), "{logged}\n{stopped}");
-    assert_eq!(line(&stopped, "led")["level"], 0);
-    let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
-    let (_, since) = page.split_once("SHUT DOWN ").unwrap_or_else(|| panic!("{page}"));
-    let (seconds, reason) = since.split_once(" s ago: ").unwrap_or_else(|| panic!("{page}"));
-    assert!(seconds.parse::<u32>().is_ok() && reason.starts_with("Command request: "), "{page}");
-    let metrics = String::from_utf8(ask(&pinion, &["--prometheus"]).stdout).unwrap();
-    assert!(metrics.contains("\npinion_state{state=\"shutdown\"} 1\n"), "{metrics}");
+        client.emergency_stop().unwrap();
+        let stopped = status(&pinion);
+        assert_eq!(stopped["state"], "shutdown");
+        assert_eq!(stopped["shutdown"]["reason"], "Command request");
+        // The log has the same text.
+        let logged = pinion.logged("shutdown: Command request: ");
+        assert!(logged.ends_with(stopped["shutdown"]["detail"].as_str().unwrap()), "{logged}\n{stopped}");
+        assert_eq!(line(&stopped, "led")["level"], 0);
+        let page = page_of(&pinion, &[]);
+        let (_, since) = page.split_once("SHUT DOWN ").unwrap_or_else(|| panic!("{page}"));
+        let (seconds, reason) = since.split_once(" s ago: ").unwrap_or_else(|| panic!("{page}"));
+        assert!(seconds.parse::<u32>().is_ok() && reason.starts_with("Command request: "), "{page}");
+        let metrics = page_of(&pinion, &["--prometheus"]);
+        assert!(metrics.contains("\npinion_state{state=\"shutdown\"} 1\n"), "{metrics}");
 
-    assert_eq!(fs::metadata(&socket).unwrap().permissions().mode() & 0o777, 0o660);
-    pinion.signal(Signal::SIGTERM);
-    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
-    assert!(!exists(&socket));
-    let gone = ask(&pinion, &[]);
-    assert_eq!(gone.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&gone.stderr).contains("no Pinion answers on"), "{gone:?}");
+        assert_eq!(fs::metadata(&socket).unwrap().permissions().mode() & 0o777, 0o660);
+        pinion.signal(Signal::SIGTERM);
+        assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+        assert!(!exists(&socket));
+        let gone = ask(&pinion, &[]);
+        assert_eq!(gone.status.code(), Some(1));
+        assert!(String::from_utf8_lossy(&gone.stderr).contains("no Pinion answers on"), "{gone:?}");
+    });
 }
 
 #[test]
@@ -269,14 +282,16 @@ fn a_narrow_terminal_shows_the_whole_reason_of_a_shutdown() {
 
 #[test]
 fn what_is_measured_is_first_and_pins_are_last() {
-    let pinion = Pinion::simulated(&["--dialect", "master"]);
-    let _client = measured(&pinion);
-    let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
-    let row =
-        |text: &str| page.lines().position(|line| line.contains(text)).unwrap_or_else(|| panic!("{text}: {page}"));
-    assert_eq!(row("objects "), row("bed_sensor"), "{page}");
-    assert!(row("bed_sensor") < row("digital output") && row("x_dir") > row("lines "), "{page}");
-    assert!(row("lines ") > row("stepper"), "{page}");
+    wait::in_time(|seconds| {
+        let pinion = Pinion::simulated(&["--dialect", "master"]);
+        let _client = measured(&pinion, seconds);
+        let page = page_of(&pinion, &[]);
+        let row =
+            |text: &str| page.lines().position(|line| line.contains(text)).unwrap_or_else(|| panic!("{text}: {page}"));
+        assert_eq!(row("objects "), row("bed_sensor"), "{page}");
+        assert!(row("bed_sensor") < row("digital output") && row("x_dir") > row("lines "), "{page}");
+        assert!(row("lines ") > row("stepper"), "{page}");
+    });
 }
 
 #[test]

@@ -80,14 +80,14 @@ mod tests {
         let begin = monotonic();
         let (sleeper, seen) = (parker.clone(), turn.clone());
         let thread = thread::spawn(move || {
-            for next in 1..=1000 {
+            for next in 1..=100 {
                 while seen.load(Ordering::Relaxed) != 2 * next - 1 {
                     sleeper.park_until(begin + LONG);
                 }
                 seen.store(2 * next, Ordering::Release);
             }
         });
-        for next in 1..=1000 {
+        for next in 1..=100 {
             turn.store(2 * next - 1, Ordering::Relaxed);
             parker.unpark();
             while turn.load(Ordering::Acquire) != 2 * next {

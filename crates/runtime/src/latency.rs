@@ -52,11 +52,11 @@ fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
     in_thread(move || {
         let scheduling = realtime::enter(Role::Worker);
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
-        let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
         let bare = MarginLimits::always(Ticks(0));
+        let waiter = Waiter::new(clock.clone(), Arc::default(), bare, scheduling, processors);
+        let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
         let mut wakeup = Lateness::default();
-        let margin =
-            run_for(&clock, Waiter::new(clock.clone(), Arc::default(), bare, scheduling, processors), end, &mut wakeup);
+        let margin = run_for(&clock, waiter, end, &mut wakeup);
         (scheduling, Half { name: "beside Pinion", edge: wakeup.clone(), wakeup, margin })
     })
 }

@@ -430,7 +430,7 @@ mod tests {
         let mut pace = Pace { speed: 2.0, from: (ago(10), 1_000_000_000) };
         // 20 s are over, and the printer is there.
         let until_ns = pace.until_ns(21_000_000_000);
-        assert!((21_000_000_000..21_100_000_000).contains(&until_ns), "{until_ns}");
+        assert!((21_000_000_000..=21_100_000_000).contains(&until_ns), "{until_ns}");
         // It is 19 s behind: it may catch up a tenth of a second.
         let mut pace = Pace { speed: 2.0, from: (ago(10), 1_000_000_000) };
         assert_eq!(pace.until_ns(2_000_000_000), 2_100_000_000);

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
+use pinion_testkit::wait;
 use serde_json::Value;
 
 use crate::links::{client, plug_in, plugged, pull_out};
@@ -90,39 +91,41 @@ fn levels(status: &Value) -> [&Value; 2] {
 }
 
 fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
-    let Wire { mcu, mut host, cut, verdict } = start();
-    begin(&mut host, if has_heater { HEAT_S } else { 0.0 });
-    let mut whole = cut(&mcu, host);
-    mcu.logged("host gone");
-    mcu.until("the end of the move", || *steps(&status(&mcu), 2) == STEPS);
-    if has_heater {
-        mcu.logged("shutdown: Missed scheduling of next digital out event");
+    wait::in_time(|_| {
+        let Wire { mcu, mut host, cut, verdict } = start();
+        begin(&mut host, if has_heater { HEAT_S } else { 0.0 });
+        let mut whole = cut(&mcu, host);
+        mcu.logged("host gone");
+        mcu.until("the end of the move", || *steps(&status(&mcu), 2) == STEPS);
+        if has_heater {
+            mcu.logged("shutdown: Missed scheduling of next digital out event");
+            let after = status(&mcu);
+            assert_eq!(after["state"], "shutdown");
+            assert_eq!(levels(&after), [0, 0], "all its outputs");
+            mcu.logged(verdict);
+        } else {
+            // Nothing else stops.
+            thread::sleep(Duration::from_secs_f64(HEAT_S));
+            let after = status(&mcu);
+            assert_eq!(after["state"], "configured", "{}", mcu.log());
+            assert_eq!(levels(&after), [1, 1], "they have no time");
+        }
+        // The motor that homes was stopped, because the trsync has expired. The other one has made its move.
         let after = status(&mcu);
-        assert_eq!(after["state"], "shutdown");
-        assert_eq!(levels(&after), [0, 0], "all its outputs");
-        mcu.logged(verdict);
-    } else {
-        // Nothing else stops.
-        thread::sleep(Duration::from_secs_f64(HEAT_S));
-        let after = status(&mcu);
-        assert_eq!(after["state"], "configured", "{}", mcu.log());
-        assert_eq!(levels(&after), [1, 1], "they have no time");
-    }
-    // The motor that homes was stopped, because the trsync has expired. The other one has made its move.
-    let after = status(&mcu);
-    assert_eq!((steps(&after, 2), steps(&after, 3)), (&STEPS.into(), &50.into()));
+        assert_eq!((steps(&after, 2), steps(&after, 3)), (&STEPS.into(), &50.into()));
 
-    let mut host = whole(&mcu);
-    let found = host.status().unwrap();
-    assert_eq!((found.is_config, found.is_shutdown), (true, has_heater), "klippy asks for this first");
-    if has_heater {
-        host.reset().unwrap();
-        assert!(!host.status().unwrap().is_config);
-    } else {
-        host.send_line("trsync_trigger oid=4 reason=2").unwrap();
-        let state = host.wait("trsync_state", Some(4), Instant::now() + WAIT_MAX).unwrap().unwrap();
-        assert_eq!(state.int("trigger_reason").unwrap(), i64::from(COMMS_TIMEOUT), "the first reason stays");
-    }
+        let mut host = whole(&mcu);
+        let found = host.status().unwrap();
+        assert_eq!((found.is_config, found.is_shutdown), (true, has_heater), "klippy asks for this first");
+        if has_heater {
+            host.reset().unwrap();
+            assert!(!host.status().unwrap().is_config);
+        } else {
+            host.send_line("trsync_trigger oid=4 reason=2").unwrap();
+            let state = host.wait("trsync_state", Some(4), Instant::now() + WAIT_MAX).unwrap().unwrap();
+            assert_eq!(state.int("trigger_reason").unwrap(), i64::from(COMMS_TIMEOUT), "the first reason stays");
+        }
+    });
 }
 
 /// A host over SSH.
@@ -249,10 +252,12 @@ fn an_ssh_that_carries_nothing_any_more() {
 #[test]
 #[ignore = "slow"]
 fn a_host_that_hangs_behind_ssh_is_no_cut() {
-    let (mcu, _near, mut host) = over_ssh();
-    // `pinion link` sends a keepalive after two seconds of silence.
-    begin(&mut host, 2.0 * HEAT_S);
-    mcu.logged("shutdown: Missed scheduling of next digital out event");
-    let verdict = mcu.logged("the host sent no commands for");
-    assert!(verdict.contains("but its computer sent keepalives"), "{verdict}");
+    wait::in_time(|_| {
+        let (mcu, _near, mut host) = over_ssh();
+        // `pinion link` sends a keepalive after two seconds of silence.
+        begin(&mut host, 2.0 * HEAT_S);
+        mcu.logged("shutdown: Missed scheduling of next digital out event");
+        let verdict = mcu.logged("the host sent no commands for");
+        assert!(verdict.contains("but its computer sent keepalives"), "{verdict}");
+    });
 }

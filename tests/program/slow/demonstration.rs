@@ -27,6 +27,14 @@ fn comes_of_lateness(wrong: &str, late_us: f64) -> bool {
     wrong.contains(" homed: endstop after ") && wrong.ends_with(" allowed") && beyond > 0.0 && beyond <= steps
 }
 
+/// What went wrong in a demonstration because timers of its MCU were late.
+fn wrong_of_lateness<'a>(out: &'a str, log: &str) -> Vec<&'a str> {
+    let late_us = log.rsplit_once(" us, at most ").unwrap().1.split_once(" us").unwrap().0.parse().unwrap();
+    let wrong: Vec<&str> = out.lines().filter(|line| line.starts_with("WRONG ")).collect();
+    assert!(wrong.iter().all(|wrong| comes_of_lateness(wrong, late_us)), "{out}\n{log}");
+    wrong
+}
+
 #[test]
 fn only_a_late_mcu_may_home_worse_than_allowed() {
     let wrong =
@@ -47,9 +55,7 @@ fn the_demonstration_is_right() {
         let status = pinion.end();
         let (out, log) = (pinion.out(), pinion.log());
         assert!(!log.contains("shutdown: Timer too close: "), "{log}");
-        let late_us = log.rsplit_once(" us, at most ").unwrap().1.split_once(" us").unwrap().0.parse().unwrap();
-        let wrong: Vec<&str> = out.lines().filter(|line| line.starts_with("WRONG ")).collect();
-        assert!(wrong.iter().all(|wrong| comes_of_lateness(wrong, late_us)), "{out}\n{log}");
+        let wrong = wrong_of_lateness(&out, &log);
         let (code, verdict) =
             if wrong.is_empty() { (0, "\nall of it was right") } else { (1, "\nNOT all of it was right") };
         assert_eq!(status.code(), Some(code), "{out}\n{log}");
@@ -62,30 +68,35 @@ fn the_demonstration_is_right() {
 #[test]
 #[ignore = "slow"]
 fn the_demonstration_fails_where_something_is_wrong() {
-    // Axes against a wall at their endstops lose the steps of the way to a stop.
-    let walled = quick_printer().replace("microsteps = 16", "microsteps = 16\novertravel_mm = 0.0");
-    let (_folder, toml) = folder_with("walled.toml", &walled);
-    let mut pinion = Pinion::start(&["sim", "-r", toml.to_str().unwrap(), "--demo"]);
-    let status = pinion.end();
-    assert_eq!(status.code(), Some(1), "{}", pinion.out());
-    let out = pinion.out();
-    assert!(out.contains("NOT all of it was right"), "{out}");
-    // Each axis is right as far as the MCU sees it. A late computer's would not be.
-    assert!(out.contains(" axis stands at 0.000 mm, 1 steps lost") && !out.contains("WRONG "), "{out}");
+    wait::in_time(|_| {
+        // Axes against a wall at their endstops lose the steps of the way to a stop.
+        let walled = quick_printer().replace("microsteps = 16", "microsteps = 16\novertravel_mm = 0.0");
+        let (_folder, toml) = folder_with("walled.toml", &walled);
+        let mut pinion = Pinion::start(&["sim", "-r", toml.to_str().unwrap(), "--demo"]);
+        let status = pinion.end();
+        assert_eq!(status.code(), Some(1), "{}", pinion.out());
+        let out = pinion.out();
+        assert!(out.contains("NOT all of it was right"), "{out}");
+        // Each axis is right as far as the MCU sees it.
+        wrong_of_lateness(&out, &pinion.log());
+        assert!(out.contains(" axis stands at 0.000 mm, 1 steps lost"), "{out}");
+    });
 }
 
 #[test]
 #[ignore = "slow"]
 fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
-    let (folder, toml) = folder_with("quick.toml", &quick_printer());
-    let log = fs::File::create(folder.path().join("log")).unwrap();
-    let mut pinion = Pinion::start_to(folder, &["sim", "-r", toml.to_str().unwrap()], closed_pipe(), log);
-    // The demonstration's own host leaves when it ends.
-    pinion.logged("host gone");
-    let mut client = pinion.client();
-    assert!(!client.status().unwrap().is_shutdown);
-    drop(client);
-    pinion.signal(Signal::SIGINT);
-    assert_eq!(pinion.end().code(), Some(0));
-    assert!(!pinion.log().contains("panicked"), "{}", pinion.log());
+    wait::in_time(|_| {
+        let (folder, toml) = folder_with("quick.toml", &quick_printer());
+        let log = fs::File::create(folder.path().join("log")).unwrap();
+        let mut pinion = Pinion::start_to(folder, &["sim", "-r", toml.to_str().unwrap()], closed_pipe(), log);
+        // The demonstration's own host leaves when it ends.
+        pinion.logged("host gone");
+        let mut client = pinion.client();
+        assert!(!client.status().unwrap().is_shutdown);
+        drop(client);
+        pinion.signal(Signal::SIGINT);
+        assert_eq!(pinion.end().code(), Some(0));
+        assert!(!pinion.log().contains("panicked"), "{}", pinion.log());
+    });
 }

@@ -432,7 +432,8 @@ mod tests {
         let clock = |word: String| word.strip_prefix("x=").unwrap().parse::<u32>().unwrap();
         let (now, later) = (clock(resolve("x=@clock").unwrap()), clock(resolve("x=clock+10s").unwrap()));
         let ahead = later.wrapping_sub(now);
-        assert!((500_000_000..2_000_000_000).contains(&ahead), "{ahead}");
+        // An estimate gets at most half a second old, and the next one may be behind it by as much.
+        assert!((474_000_000..2_000_000_000).contains(&ahead), "{ahead}");
         assert!(resolve("x=clock+1").unwrap_err().contains("clock+0.5s"));
         assert!(resolve("x=100s").unwrap_err().contains("32 bits"));
         drop(console);

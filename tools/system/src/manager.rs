@@ -117,7 +117,9 @@ mod tests {
         }
         // The remedy, before systemd has read it, and after.
         tree.put("etc/systemd/system.conf.d/99-pinion.conf", "[Manager]\nRuntimeWatchdogSec=off\n");
-        let (words, remedy) = found(&tree, Some("RuntimeWatchdogUSec=1min"));
+        // A busy computer may start the program later than it is waited for.
+        let mut asked = (0..5).map(|_| found(&tree, Some("RuntimeWatchdogUSec=1min")));
+        let (words, remedy) = asked.find(|(words, _)| !words.is_empty()).expect("an answer");
         assert!(words.ends_with("RuntimeWatchdogUSec=1min in the running one"), "{words}");
         assert!(remedy.starts_with("sudo systemctl daemon-reexec; or watchdog = false"), "{remedy}");
         assert_eq!(found(&tree, Some("RuntimeWatchdogUSec=0")).0, "");

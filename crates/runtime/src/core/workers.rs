@@ -377,6 +377,11 @@ mod tests {
         Threads::new(Arc::default(), Arc::new(|| ()), Arc::new(clock), heartbeat, Recording::of_a_test(), true)
     }
 
+    /// How many messages the first worker has not taken yet.
+    fn waiting(threads: &Threads) -> usize {
+        QUEUE_JOBS - threads.workers[0].jobs.slots()
+    }
+
     #[test]
     fn what_was_asked_for_before_the_end_is_done_in_order() {
         let (job, release, heard) = slow();
@@ -386,7 +391,11 @@ mod tests {
         for number in 0..5 {
             submit(&mut threads, worker, job(number), false);
         }
+        // The end as `reset` begins it, which would leave the worker behind if the computer is busy for two seconds.
+        threads.workers[0].quit.store(true, Ordering::Release);
         drop(release);
+        let end = monotonic() + Duration::from_secs(60);
+        assert!(wait_until(end, || threads.workers[0].thread.is_finished()), "it does not end");
         threads.reset();
         drop(job);
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
@@ -401,6 +410,10 @@ mod tests {
             submit(&mut threads, worker, job(number), false);
         }
         drop(job);
+        // A job that is not under way yet would be dropped.
+        while waiting(&threads) > 1 {
+            thread::sleep(Duration::from_millis(1));
+        }
         threads.reset();
         assert!(!threads.has_completion());
         // Another one takes its place.
@@ -410,13 +423,12 @@ mod tests {
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
     }
 
-    #[test]
-    fn a_worker_that_only_reads_is_not_waited_for() {
+    /// How long the end of a worker takes that only reads, and is in the middle of it.
+    fn end_of_a_reader() -> Duration {
         let (job, release, heard) = slow();
         let mut threads = threads();
         let worker = threads.start("w1 28-1").unwrap();
         threads.leave_behind(worker);
-        let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
         submit(&mut threads, worker, job(7), false);
         // A job that is not under way yet would be dropped.
         while waiting(&threads) > 0 {
@@ -424,12 +436,19 @@ mod tests {
         }
         let began = monotonic();
         threads.reset();
-        assert!(monotonic() - began < END_LIMIT, "it was waited for");
+        let took = monotonic() - began;
         assert!(heard.try_recv().is_err());
         // It continues, and nobody gets its result.
         threads.start("w1 28-1").unwrap();
         drop(release);
         assert_eq!(heard.recv(), Ok(7));
         assert!(!threads.has_completion());
+        took
+    }
+
+    #[test]
+    fn a_worker_that_only_reads_is_not_waited_for() {
+        // A busy computer may take as long for something else, but not each time.
+        assert!((0..3).any(|_| end_of_a_reader() < END_LIMIT), "it was waited for");
     }
 }

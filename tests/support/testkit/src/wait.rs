@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How a test waits for another thread or process: for the thing itself, never for a time.
 
+use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -39,18 +40,73 @@ pub fn until_some<T>(mut result: impl FnMut() -> Option<T>, what: impl FnOnce() 
     }
 }
 
-/// Runs the part of a test in which an MCU gets commands for a time to come. The part gets that time in seconds. An MCU
-/// stops if it or its host is too late, as on a busy computer. Then the part runs again, with more time.
+/// What an MCU says that is too late itself, or whose host is.
+const LATE: [&str; 2] = ["Timer too close", "Rescheduled timer in the past"];
+
+thread_local! {
+    /// The logs of the programs of a part that fails.
+    static LOGS: RefCell<String> = const { RefCell::new(String::new()) };
+}
+
+/// Takes the log of a program while its test panics, for [`in_time`].
+pub fn failed_with(log: &str) {
+    LOGS.with_borrow_mut(|logs| logs.push_str(log));
+}
+
+/// Fails in a way after which [`in_time`] repeats its part: the test was so late that a program did not wait for it.
+///
+/// # Panics
+///
+/// Always.
+#[track_caller]
+pub fn was_late(what: &str) -> ! {
+    failed_with(LATE[0]);
+    panic!("the test itself was late: {what}")
+}
+
+/// Runs the part of a test that a busy computer may spoil. An MCU stops if it or its host is too late: a host sends its
+/// commands for a time to come, and an idle core must run once in a second. Then the part runs again. It gets a time to
+/// come in seconds, each time more.
 pub fn in_time<T>(mut part: impl FnMut(f64) -> T) -> T {
     for seconds in [1.0, 4.0] {
+        LOGS.take();
         let panic = match catch_unwind(AssertUnwindSafe(|| part(seconds))) {
             Ok(result) => return result,
             Err(panic) => panic,
         };
         let text = panic.downcast_ref::<String>().map_or("", |text| text);
-        if !["Timer too close", "Rescheduled timer in the past"].iter().any(|late| text.contains(late)) {
+        let logs = LOGS.take();
+        if !LATE.iter().any(|late| text.contains(late) || logs.contains(late)) {
             resume_unwind(panic);
         }
     }
     part(16.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_part_that_was_late_runs_again() {
+        let mut runs = 0;
+        let seconds = in_time(|seconds| {
+            runs += 1;
+            match runs {
+                1 => failed_with("INFO  shutdown: Timer too close: the host's block came late"),
+                2 => was_late("as it says"),
+                _ => return seconds,
+            }
+            panic!("a log line that is missing")
+        });
+        assert_eq!((runs, seconds), (3, 16.0));
+        let mut runs = 0;
+        let wrong = catch_unwind(AssertUnwindSafe(|| {
+            in_time(|_| {
+                runs += 1;
+                assert_eq!(runs, 0, "something else");
+            })
+        }));
+        assert!(wrong.is_err() && runs == 1);
+    }
 }

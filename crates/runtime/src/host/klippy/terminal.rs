@@ -152,20 +152,21 @@ fn has_open(proc: &Path, pid: u32, terminal: Terminal, left: &mut usize) -> io::
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nix::fcntl::{FcntlArg, FdFlag, fcntl};
-    use nix::pty::{OpenptyResult, openpty};
-    use nix::unistd::ttyname;
+    use nix::fcntl::OFlag;
+    use nix::pty::{OpenptyResult, grantpt, posix_openpt, ptsname_r, unlockpt};
+    use std::os::unix::fs::OpenOptionsExt;
     use std::path::PathBuf;
     use std::process::{Child, Command, Stdio};
 
-    /// A terminal whose ends no other test's process inherits.
+    /// A terminal whose ends no other test's process inherits, even if it is started at this moment: openpty(3) cannot
+    /// open them like that.
     fn terminal() -> (OpenptyResult, PathBuf) {
-        let pty = openpty(None, None).unwrap();
-        for end in [&pty.master, &pty.slave] {
-            fcntl(end, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).unwrap();
-        }
-        let device = ttyname(&pty.slave).unwrap();
-        (pty, device)
+        let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let device = PathBuf::from(ptsname_r(&master).unwrap());
+        let slave = fs::File::options().read(true).write(true).custom_flags(OFlag::O_NOCTTY.bits()).open(&device);
+        (OpenptyResult { master: master.into(), slave: slave.unwrap().into() }, device)
     }
 
     fn look(device: &Path) -> io::Result<Search> {
