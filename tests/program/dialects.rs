@@ -247,27 +247,29 @@ fn is_shutdown(pinion: &Pinion) -> bool {
 
 #[test]
 fn a_new_process_of_the_host_finds_a_fresh_mcu_and_the_same_one_does_not() {
-    const RENEWED: &str = "the host's process is gone and another has come: the MCU is reset for it";
-    let pinion = Pinion::simulated(&[]);
-    let checkout = Checkout::of("master");
-    let mut host = Host::start(&pinion, &checkout);
-    configure_and_stop(&pinion);
-    until_once_more(&pinion, "host gone", || host.turn("closed"));
-    host.turn("open");
-    assert!(is_shutdown(&pinion), "RESTART keeps the process");
-    assert!(!pinion.log().contains(RENEWED));
-    until_once_more(&pinion, "host gone", || drop(host));
-    let mut host = Host::start(&pinion, &checkout);
-    assert!(!is_shutdown(&pinion), "a new process");
-    pinion.logged(RENEWED);
-    // A process that looks in while the host lives changes nothing.
-    configure_and_stop(&pinion);
-    until_once_more(&pinion, "host gone", || host.turn("closed"));
-    let other = Host::start(&pinion, &checkout);
-    assert!(is_shutdown(&pinion), "the host lives");
-    until_once_more(&pinion, "host gone", || drop(other));
-    host.turn("open");
-    assert!(is_shutdown(&pinion), "the host of before");
+    wait::in_time(|_| {
+        const RENEWED: &str = "the host's process is gone and another has come: the MCU is reset for it";
+        let pinion = Pinion::simulated(&[]);
+        let checkout = Checkout::of("master");
+        let mut host = Host::start(&pinion, &checkout);
+        configure_and_stop(&pinion);
+        until_once_more(&pinion, "host gone", || host.turn("closed"));
+        host.turn("open");
+        assert!(is_shutdown(&pinion), "RESTART keeps the process");
+        assert!(!pinion.log().contains(RENEWED));
+        until_once_more(&pinion, "host gone", || drop(host));
+        let mut host = Host::start(&pinion, &checkout);
+        assert!(!is_shutdown(&pinion), "a new process");
+        pinion.logged(RENEWED);
+        // A process that looks in while the host lives changes nothing.
+        configure_and_stop(&pinion);
+        until_once_more(&pinion, "host gone", || host.turn("closed"));
+        let other = Host::start(&pinion, &checkout);
+        assert!(is_shutdown(&pinion), "the host lives");
+        until_once_more(&pinion, "host gone", || drop(other));
+        host.turn("open");
+        assert!(is_shutdown(&pinion), "the host of before");
+    });
 }
 
 /// Somebody writes FORCE_SHUTDOWN while the search still looks at the new host.
@@ -333,69 +335,71 @@ fn capabilities(pid: u32) -> u64 {
 
 #[test]
 fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_what_it_takes() {
-    if !nix::unistd::geteuid().is_root() {
-        return here::not_run("only root can start a host of another user");
-    }
-    /// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE.
-    const LOOKS: u64 = 1 << 2 | 1 << 19;
-    for may_look in [true, false] {
-        // A user's home that nobody else may enter, with a klippy.
-        let checkout = Checkout::of("v0.12");
-        for path in [checkout.0.path(), checkout.program().parent().unwrap()] {
-            std::os::unix::fs::chown(path, Some(12_345), Some(12_345)).unwrap();
+    wait::in_time(|_| {
+        if !nix::unistd::geteuid().is_root() {
+            return here::not_run("only root can start a host of another user");
         }
-        fs::set_permissions(checkout.0.path(), fs::Permissions::from_mode(0o700)).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
-        let program = crate::process::program_in(folder.path());
-        let tty = folder.path().join("tty");
-        let log = folder.path().join("log");
-        let capabilities_given = if may_look { "+sys_ptrace,+dac_read_search" } else { "-all" };
-        let pinion = Command::new("setpriv")
-            .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
-            .arg(format!("--inh-caps={capabilities_given}"))
-            .arg(format!("--ambient-caps={capabilities_given}"))
-            .arg(&program)
-            .args(["run", "--board", "sim", "-m", "0666", "-I"])
-            .arg(&tty)
-            .stdout(Stdio::null())
-            .stderr(fs::File::create(&log).unwrap())
-            .spawn();
-        let pinion = Running(pinion.unwrap());
-        let log = || fs::read_to_string(&log).unwrap();
-        let until = |what: &str| {
-            let line = || log().lines().find(|line| line.contains(what)).map(str::to_owned);
-            wait::until_some(line, || format!("{what}:\n{}", log()))
-        };
-        until("serving on");
-        let script = format!("exec 3<>{}; echo open; read line", tty.display());
-        let host = Command::new("setpriv")
-            .args(["--reuid=12345", "--regid=12345", "--clear-groups", "/bin/sh", "-c", &script, "python3"])
-            .arg(checkout.program())
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn();
-        let mut host = Running(host.unwrap());
-        std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
-        // The test's own client belongs to root, so it is hidden too. It is not klippy.
-        let client = pinion_client::Client::connect(&tty, crate::process::WAIT_MAX).unwrap();
-        let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
-        assert_eq!(has_it, may_look);
-        if may_look {
-            let line = until("the host is klippy of ");
-            assert!(line.contains(&format!("process {}: it gets each message", host.0.id())), "{line}");
-            let search = search_of(pinion.0.id()).unwrap();
-            assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
-            // Another process of its user cannot get at them through its memory: the kernel asks for the same rights.
-            let other = Command::new("setpriv")
-                .args(["--reuid=65534", "--regid=65534", "--clear-groups", "dd", "count=1", "of=/dev/null"])
-                .arg(format!("if=/proc/{search}/environ"))
-                .output()
-                .unwrap();
-            assert!(String::from_utf8_lossy(&other.stderr).contains("Permission denied"), "{other:?}");
-        } else {
-            // Other klippys may run here, and they are hidden as well.
-            until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");
+        /// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE.
+        const LOOKS: u64 = 1 << 2 | 1 << 19;
+        for may_look in [true, false] {
+            // A user's home that nobody else may enter, with a klippy.
+            let checkout = Checkout::of("v0.12");
+            for path in [checkout.0.path(), checkout.program().parent().unwrap()] {
+                std::os::unix::fs::chown(path, Some(12_345), Some(12_345)).unwrap();
+            }
+            fs::set_permissions(checkout.0.path(), fs::Permissions::from_mode(0o700)).unwrap();
+            let folder = tempfile::tempdir().unwrap();
+            fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
+            let program = crate::process::program_in(folder.path());
+            let tty = folder.path().join("tty");
+            let log = folder.path().join("log");
+            let capabilities_given = if may_look { "+sys_ptrace,+dac_read_search" } else { "-all" };
+            let pinion = Command::new("setpriv")
+                .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
+                .arg(format!("--inh-caps={capabilities_given}"))
+                .arg(format!("--ambient-caps={capabilities_given}"))
+                .arg(&program)
+                .args(["run", "--board", "sim", "-m", "0666", "-I"])
+                .arg(&tty)
+                .stdout(Stdio::null())
+                .stderr(fs::File::create(&log).unwrap())
+                .spawn();
+            let pinion = Running(pinion.unwrap());
+            let log = || fs::read_to_string(&log).unwrap();
+            let until = |what: &str| {
+                let line = || log().lines().find(|line| line.contains(what)).map(str::to_owned);
+                wait::until_some(line, || format!("{what}:\n{}", log()))
+            };
+            until("serving on");
+            let script = format!("exec 3<>{}; echo open; read line", tty.display());
+            let host = Command::new("setpriv")
+                .args(["--reuid=12345", "--regid=12345", "--clear-groups", "/bin/sh", "-c", &script, "python3"])
+                .arg(checkout.program())
+                .stdin(Stdio::piped())
+                .stdout(Stdio::piped())
+                .spawn();
+            let mut host = Running(host.unwrap());
+            std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
+            // The test's own client belongs to root, so it is hidden too. It is not klippy.
+            let client = pinion_client::Client::connect(&tty, crate::process::WAIT_MAX).unwrap();
+            let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
+            assert_eq!(has_it, may_look, "{}", log());
+            if may_look {
+                let line = until("the host is klippy of ");
+                assert!(line.contains(&format!("process {}: it gets each message", host.0.id())), "{line}");
+                let search = search_of(pinion.0.id()).unwrap();
+                assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
+                // Another process of its user cannot get at them through its memory: the kernel asks for the same rights.
+                let other = Command::new("setpriv")
+                    .args(["--reuid=65534", "--regid=65534", "--clear-groups", "dd", "count=1", "of=/dev/null"])
+                    .arg(format!("if=/proc/{search}/environ"))
+                    .output()
+                    .unwrap();
+                assert!(String::from_utf8_lossy(&other.stderr).contains("Permission denied"), "{other:?}");
+            } else {
+                // Other klippys may run here, and they are hidden as well.
+                until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");
+            }
         }
-    }
+    });
 }

@@ -40,8 +40,9 @@ pub fn until_some<T>(mut result: impl FnMut() -> Option<T>, what: impl FnOnce() 
     }
 }
 
-/// What an MCU says that is too late itself, or whose host is.
-const LATE: [&str; 2] = ["Timer too close", "Rescheduled timer in the past"];
+/// What an MCU says that is too late itself, or whose host or search is.
+const LATE: [&str; 3] =
+    ["Timer too close", "Rescheduled timer in the past", "the host's messages were not found within"];
 
 thread_local! {
     /// The logs of the programs of a part that fails.
@@ -65,8 +66,8 @@ pub fn was_late(what: &str) -> ! {
 }
 
 /// Runs the part of a test that a busy computer may spoil. An MCU stops if it or its host is too late: a host sends its
-/// commands for a time to come, and an idle core must run once in a second. Then the part runs again. It gets a time to
-/// come in seconds, each time more.
+/// commands for a time to come, and an idle core must run once in a second. The search for the host has three. Then the
+/// part runs again. It gets a time to come in seconds, each time more.
 pub fn in_time<T>(mut part: impl FnMut(f64) -> T) -> T {
     for seconds in [1.0, 4.0] {
         LOGS.take();
