@@ -20,7 +20,7 @@ use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
 use pinion_testkit::wait;
 
-use crate::process::{FAREWELL, Pinion, WAIT_MAX, exists, last_reason, output};
+use crate::process::{Pinion, WAIT_MAX, exists, last_reason, late_for_the_farewell, output};
 
 #[test]
 fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
@@ -268,8 +268,8 @@ fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
             }
         }
         let reasons: Vec<String> = last.iter().filter_map(|params| params.text("static_string_id").ok()).collect();
-        if reasons.is_empty() && signaled.elapsed() >= FAREWELL {
-            wait::was_late("the terminal is closed");
+        if reasons.is_empty() {
+            late_for_the_farewell(signaled);
         }
         assert_eq!(reasons, ["Command request"], "{last:?}");
         drop((client, tty));

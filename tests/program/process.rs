@@ -231,14 +231,19 @@ impl Drop for Pinion {
 }
 
 /// How long the program keeps the terminal at its end, for a host that still reads.
-pub const FAREWELL: Duration = Duration::from_secs(1);
+const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Repeats a part in [`wait::in_time`] in which a host did not read what a program said that ends since then: it was late.
+pub fn late_for_the_farewell(since: Instant) {
+    if since.elapsed() >= FAREWELL {
+        wait::was_late("the terminal is closed");
+    }
+}
 
 /// The last reason that a host reads from a program that ends since then.
 pub fn last_reason(client: &mut Client, since: Instant) -> Option<String> {
     client.wait_shutdown(WAIT_MAX).unwrap_or_else(|error| {
-        if since.elapsed() >= FAREWELL {
-            wait::was_late("the terminal is closed");
-        }
+        late_for_the_farewell(since);
         panic!("{error}")
     })
 }

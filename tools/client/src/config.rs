@@ -8,7 +8,7 @@ use flate2::Crc;
 
 use super::{Client, Error};
 
-/// Timeout for a reset.
+/// Timeout for a reset, and for the answer to an emergency stop.
 const RESET_TIMEOUT: Duration = Duration::from_secs(60);
 /// klippy's pause between the steps of a reset.
 const RESET_PAUSE: Duration = Duration::from_millis(15);

@@ -40,9 +40,10 @@ pub fn until_some<T>(mut result: impl FnMut() -> Option<T>, what: impl FnOnce() 
     }
 }
 
-/// What an MCU says that is too late itself, or whose host or search is.
-const LATE: [&str; 3] =
-    ["Timer too close", "Rescheduled timer in the past", "the host's messages were not found within"];
+/// What an MCU says that is too late itself, or whose host or search is; what [`was_late`] says.
+const LATE: [&str; 4] =
+    ["Timer too close", "Rescheduled timer in the past", "the host's messages were not found within", TEST_WAS_LATE];
+const TEST_WAS_LATE: &str = "the test itself was late";
 
 thread_local! {
     /// The logs of the programs of a part that fails.
@@ -61,8 +62,7 @@ pub fn failed_with(log: &str) {
 /// Always.
 #[track_caller]
 pub fn was_late(what: &str) -> ! {
-    failed_with(LATE[0]);
-    panic!("the test itself was late: {what}")
+    panic!("{TEST_WAS_LATE}: {what}")
 }
 
 /// Runs the part of a test that a busy computer may spoil. An MCU stops if it or its host is too late: a host sends its
